@@ -46,6 +46,7 @@ from tormagd.record.writer import (
     THINNED,
     TICKS_TOPIC,
     Derived,
+    Shown,
     is_tick,
 )
 from tormagd_client.printable import printable
@@ -68,6 +69,7 @@ MAX_CORE_BYTES, MAX_ENTRIES = 50_000_000, 1_000_000
 "Bounds on what is read of one file, a minute of 1 kHz; what comes after is passed over."
 NO_BLACK_BOX = f"no black box of tormagd: it has nothing in {CORE_TOPIC}, or not what a replay needs"
 TOPICS = (TELEMETRY_TOPIC, TICKS_TOPIC)
+DERIVED = (*TOPICS, FRAMES_TOPIC)
 UNREADABLE = (
     McapError, ZstdError, EOFError, ValueError, OverflowError, MemoryError, RecursionError, struct.error,
     msgspec.MsgspecError,
@@ -77,14 +79,6 @@ UNREADABLE = (
 
 class RecordingError(ValueError):
     """A file that is not a readable recording; the text names the file and what is wrong."""
-
-
-class Seen(NamedTuple):
-    """A control tick or a snapshot, with the fields that were wanted; its time is ns since 1970."""
-
-    t_ns: int
-    is_tick: bool
-    message: Any
 
 
 @contextlib.contextmanager
@@ -256,8 +250,8 @@ class Contents:
             at = record.chunk_start_offset if isinstance(record, ChunkIndex) else at
             self.places.append(Place(record.message_start_time, record.message_end_time, at))
 
-    def messages(self, file: BinaryIO, from_ns: int = 0, to_ns: int = END_NS) -> Iterator[tuple[str, Message]]:
-        """Yield the messages, with their topics, of the chunks that have some of this time, and are not damaged."""
+    def messages(self, file: BinaryIO, from_ns: int = 0, to_ns: int = END_NS) -> Iterator[Shown]:
+        """Yield the messages, undecoded, of the chunks that have some of this time, and are not damaged."""
         if not self.places:
             self._look_for_chunks(file)
         size = 0
@@ -276,14 +270,15 @@ class Contents:
             for record in records:
                 self._take(record, place.at)
                 if isinstance(record, Message):
-                    yield self.topics.get(record.channel_id, ""), record
+                    topic = self.topics.get(record.channel_id, "")
+                    yield Shown(topic, record.log_time, record.sequence, record.data)
 
-    def read(self, file: BinaryIO, wanted: Any, *times_ns: int) -> Iterator[Seen]:
+    def read(self, file: BinaryIO, wanted: Any, *times_ns: int) -> Iterator[Shown]:
         """Yield the ticks and snapshots of `messages`, decoded as `wanted`."""
         decode = msgspec.json.Decoder(wanted).decode
-        for topic, sent in self.messages(file, *times_ns):
+        for topic, t_ns, sequence, data in self.messages(file, *times_ns):
             if topic in TOPICS:
-                yield Seen(sent.log_time, topic == TICKS_TOPIC, decode(sent.data))
+                yield Shown(topic, t_ns, sequence, decode(data))
         if len(self.lost) == len(self.places) > 0:
             raise ValueError(next(iter(self.lost.values())))
         self._require_topics()
@@ -307,7 +302,7 @@ class Contents:
             return None
 
 
-def read_open(file: BinaryIO, name: str, wanted: Any, each: Callable[[Seen], None]) -> Contents:
+def read_open(file: BinaryIO, name: str, wanted: Any, each: Callable[[Shown], None]) -> Contents:
     """Read an open recording: each tick and snapshot goes to `each`."""
     with readable(name):
         found = Contents(file, name)
@@ -316,7 +311,7 @@ def read_open(file: BinaryIO, name: str, wanted: Any, each: Callable[[Seen], Non
     return found
 
 
-def read_recording(path: Path, wanted: Any, each: Callable[[Seen], None]) -> Contents:
+def read_recording(path: Path, wanted: Any, each: Callable[[Shown], None]) -> Contents:
     """Read the recording in `path`: each tick and snapshot, decoded as `wanted`, goes to `each`."""
     with opened(path) as file:
         return read_open(file, str(path), wanted, each)
@@ -334,7 +329,7 @@ class RecordingFile(Contents):
             if overview is None:
                 builder = OverviewBuilder()
                 for seen in self.read(file, Glance):
-                    builder.add(*seen)
+                    builder.add(seen.t_ns, seen.is_tick, seen.message)
                 overview = builder.made()
         self.overview, lost, known = overview, list(self.lost.values()), self.metadata
         self.notes = [
@@ -345,9 +340,9 @@ class RecordingFile(Contents):
         ]
         "What its reader has to know, in words."
 
-    def between(self, from_ns: int, to_ns: int, wanted: Any) -> list[Seen]:
+    def between(self, from_ns: int, to_ns: int, wanted: Any) -> list[Shown]:
         """Return the ticks and snapshots from `from_ns` to `to_ns`, inclusive, in the file's order."""
-        found: list[Seen] = []
+        found: list[Shown] = []
         with opened(self.path) as file:
             for seen in self.read(file, wanted, from_ns, to_ns):
                 if from_ns <= seen.t_ns <= to_ns:
@@ -367,9 +362,8 @@ class BlackBoxFile(Contents):
     def __init__(self, path: Path) -> None:
         self.path, self.entries = path, list[Any]()
         self.odd, self._is_over = "", False
-        "The first message of another topic that `/core` does not give, or why an entry of `/core` gives none."
-        topics = TICKS_TOPIC, FRAMES_TOPIC, TELEMETRY_TOPIC
-        self._expected: dict[str, deque[tuple[int, int, bytes]]] = {topic: deque() for topic in topics}
+        "The first message of another topic that is not what `/core` gives, or why an entry of `/core` gives none."
+        self._expected: deque[Shown] = deque()
         self._derived, self._size = Derived(), 0
         self._tick: int | None = None
         with opened(path) as file:
@@ -378,9 +372,8 @@ class BlackBoxFile(Contents):
             damage = damage_in(file)
         if not self.entries:
             raise RecordingError(f"{path}: {NO_BLACK_BOX}")
-        for topic, expected in self._expected.items() if self.is_complete else ():
-            if expected:
-                self._note(f"message {expected[0][0]} is missing in {topic}, and {CORE_TOPIC} has it")
+        if self._expected and self.is_complete:
+            self._note_other(self._expected[0])
         self._note(damage)
 
     @property
@@ -390,19 +383,22 @@ class BlackBoxFile(Contents):
     def _note(self, odd: str) -> None:
         self.odd = self.odd or odd
 
+    def _note_other(self, shown: Shown) -> None:
+        self._note(f"message {shown.sequence} in {shown.topic} is not what {CORE_TOPIC} has")
+
     def _read_core(self, file: BinaryIO) -> None:
         """Keep the entries of `/core`, and compare what is derived of them, as far as no chunk is lost."""
-        for topic, sent in self.messages(file):
+        for sent in self.messages(file):
             if "format" not in self.metadata or self._is_over:
                 return  # before all of a long recording has been read
-            if self.lost:
+            if sent.topic == CORE_TOPIC:
+                self._part(msgspec.json.decode(self.metadata.get("columns", "[]"), type=tuple[str, ...]), sent.message)
+            elif self.lost or self.odd:
                 self._expected.clear()
-            if topic == CORE_TOPIC:
-                self._part(msgspec.json.decode(self.metadata.get("columns", "[]"), type=tuple[str, ...]), sent.data)
-            elif topic in self._expected and not self.odd:
-                expected = self._expected[topic]
-                if not expected or (sent.sequence, sent.log_time, sent.data) != expected.popleft():
-                    self._note(f"message {sent.sequence} in {topic} is not what {CORE_TOPIC} has")
+            elif sent.topic in DERIVED:
+                expected = self._expected.popleft() if self._expected else None
+                if sent != expected:
+                    self._note_other(expected or sent)
 
     def _part(self, columns: tuple[str, ...], data: bytes) -> None:
         entries, self._size = msgspec.msgpack.decode(data, type=list[Any]), self._size + len(data)
@@ -411,8 +407,8 @@ class BlackBoxFile(Contents):
             return
         try:
             self._join([each[columns.index(NUMBER_COLUMN)] for each in entries if is_tick(each)])
-            for topic, t_ns, number, shown in self._derived.of(columns, entries) if self._expected else ():
-                self._expected[topic].append((number, t_ns, msgspec.json.encode(shown)))
+            for shown in self._derived.of(columns, entries):
+                self._expected.append(shown._replace(message=msgspec.json.encode(shown.message)))
         except (ValueError, TypeError, AttributeError, OverflowError, LookupError) as error:
             self._note(f"{CORE_TOPIC}: {str(error)[:100]}")
         self.entries.extend(entries)

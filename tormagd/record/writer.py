@@ -94,6 +94,10 @@ class Shown(NamedTuple):
     sequence: int
     message: Any
 
+    @property
+    def is_tick(self) -> bool:
+        return self.topic == TICKS_TOPIC
+
 
 class Thinning:
     """Keeps one tick of `every` where nothing happens, and all within AROUND_S of a fault or a mark."""
@@ -185,7 +189,6 @@ class RecordingWriter:
         if every > 1:
             self._about[THINNED] = f"one tick of {every}; all within {AROUND_S:g} s of a fault or a mark"
         self._last_tick: int | None = None
-        self._mark: Mark | None = None
         self.telemetry_count = self.tick_count = self.ticks_lost = self.restarts = 0
         self._begin(place.new() if isinstance(place, RecordingFolder) else place)
 
@@ -245,13 +248,13 @@ class RecordingWriter:
             adds[each.topic](each)
 
     def _snapshot(self, shown: Shown) -> None:
-        mark = msgspec.convert(shown.message.get("mark"), Mark | None)
-        if mark not in (None, self._mark):  # every snapshot has the newest
-            self._thinning.happened(shown.t_ns)
-            self._mark = mark
         self._add(shown)
         self.telemetry_count += 1
-        if self._overview.add(shown.t_ns, False, {"mark": mark}) and self._folder is not None:
+        mark = msgspec.convert(shown.message.get("mark"), Mark | None)
+        if not self._overview.add(shown.t_ns, False, {"mark": mark}):
+            return
+        self._thinning.happened(shown.t_ns)
+        if self._folder is not None:
             try:
                 self.path = self._folder.mark_around(self.path)
             except (OSError, ValueError) as error:  # somebody has renamed it
@@ -295,15 +298,14 @@ class RecordingWriter:
             self.close()
 
     def _channel_of(self, topic: str) -> int:
-        schema, schema_id = self._schemas[topic], 0
-        title = schema["title"] if schema else ""
-        if (topic, title) not in self._channels:
+        schema, schema_id, encoding = self._schemas[topic], 0, "msgpack"
+        known = topic, schema["title"] if schema else ""
+        if known not in self._channels:
             if schema:
-                data = msgspec.json.encode(schema)
-                schema_id = self._mcap.register_schema(name=title, encoding="jsonschema", data=data)
-            encoding = "json" if schema else "msgpack"
-            self._channels[topic, title] = self._mcap.register_channel(topic, encoding, schema_id)
-        return self._channels[topic, title]
+                schema_id = self._mcap.register_schema(schema["title"], "jsonschema", msgspec.json.encode(schema))
+                encoding = "json"
+            self._channels[known] = self._mcap.register_channel(topic, encoding, schema_id)
+        return self._channels[known]
 
     def _add(self, shown: Shown) -> None:
         topic, t_ns, sequence, message = shown
