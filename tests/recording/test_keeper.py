@@ -35,6 +35,9 @@ PATIENCE_S = 60.0
 HEADER = {"format": "0", "scene": "a", "columns": json.dumps(["t_ns", "x"])}
 
 
+BEGUN = Begin("/boxes", HEADER)
+
+
 def part(time_s: float, size: int = 100) -> Part:
     return Part(time_s, bytes(size))
 
@@ -50,7 +53,7 @@ def kept(ring: Ring) -> int:
 def test_the_ring_keeps_half_a_minute_of_a_day() -> None:
     ring = Ring()
     for number in range(10_000):
-        ring.put(part(0.02 * number))
+        ring.put(BEGUN, part(0.02 * number))
     parts = parts_in(ring)
     assert parts[-1].time_s - parts[0].time_s == pytest.approx(KEPT_S, abs=0.021)
 
@@ -58,10 +61,10 @@ def test_the_ring_keeps_half_a_minute_of_a_day() -> None:
 def test_the_ring_holds_no_more_bytes_than_it_may() -> None:
     ring = Ring()
     for number in range(300):
-        ring.put(part(0.001 * number, 1_000_000))
+        ring.put(BEGUN, part(0.001 * number, 1_000_000))
         if number % 40 == 39:
             assert MAX_BYTES // 2 - 1_000_000 <= kept(ring) <= MAX_BYTES or number < 60
-    ring.put(part(1.0, MAX_BYTES + 1))
+    ring.put(BEGUN, part(1.0, MAX_BYTES + 1))
     assert parts_in(ring)[-1].time_s == 1.0  # the newest is always there
     assert os.fstat(ring.file).st_blocks * 512 < 2 * MAX_BYTES + 2_000_000
 
@@ -72,7 +75,7 @@ def test_neither_bound_is_passed(steps: list[tuple[float, int]]) -> None:
     ring, now_s = Ring(None, 5.0, 200), 0.0
     for step_s, size in steps:
         now_s += step_s
-        ring.put(part(now_s, size))
+        ring.put(BEGUN, part(now_s, size))
         parts = parts_in(ring)
         assert kept(ring) <= 200
         assert parts[-1].time_s - parts[0].time_s <= 5.0
@@ -82,8 +85,7 @@ def test_neither_bound_is_passed(steps: list[tuple[float, int]]) -> None:
 def test_a_ring_that_broke_off_within_a_part_has_those_before() -> None:
     ring, scenes = Ring(), [Begin("/boxes", {"scene": name}) for name in "ab"]
     for number, begun in enumerate(scenes):
-        ring.begin(begun)
-        ring.put(part(float(number)))
+        ring.put(begun, part(float(number)))
         os.pwrite(ring.file, b"\xc1" * 50, ring._at + 4)
     assert [(begun, each.time_s) for begun, each in Ring(ring.file).kept()] == [(scenes[0], 0.0), (scenes[1], 1.0)]
 
@@ -115,9 +117,9 @@ class Process:
     def say(self, *words: Begin | Part | Write | End) -> None:
         for word in words:
             if isinstance(word, Begin):
-                self.ring.begin(word)
+                self.begun = word
             elif isinstance(word, Part):
-                self.ring.put(word)
+                self.ring.put(self.begun, word)
             else:
                 self.ours.send(msgspec.msgpack.encode(word))
 
@@ -202,10 +204,9 @@ def test_what_a_killed_keeper_had_is_there_after_it(process: Process, tmp_path: 
     if is_daemon_killed:
         process.die()
         after = Process(tmp_path)
-        after.say(Begin(str(tmp_path), HEADER))
     else:
         after = Process(tmp_path, process.ring)
-    after.say(ticks(21, 20), written(tmp_path, "2Z-Y.mcap"))
+    after.say(Begin(str(tmp_path), HEADER), ticks(21, 20), written(tmp_path, "2Z-Y.mcap"))
     while after.heard().name != "2Z-Y.mcap":
         pass
     after.say(End())

@@ -101,7 +101,6 @@ class BlackBox:
             log.warning("no black box is kept: %s; next: mend that and start the daemon again", self._refusal)
         else:
             self._ring = Ring(in_shared_memory(str(folder)))
-            self._ring.begin(self.begun)
             self.look()
         self.journal = Journal(is_kept=self._ring is not None)
         self._ticks = PART_TICKS // 2
@@ -116,8 +115,6 @@ class BlackBox:
     def begin_scene(self, header: dict[str, str], stepper: Stepper, planner: Planner) -> None:
         """Begin anew with the core of another scene, from a snapshot of these states."""
         self.begun = Begin(str(self._folder), header)
-        if self._ring is not None:
-            self._ring.begin(self.begun)
         self._begin_anew(stepper, planner)
 
     def ticked(self, moment: Moment, stepper: Stepper, planner: Planner) -> tuple[bytes, list[Any]] | None:
@@ -135,7 +132,7 @@ class BlackBox:
                 entries = self.journal.take()
                 part = packed(entries), [each for each in entries if isinstance(each, msgspec.Raw)]
                 if self._ring is not None:
-                    self._ring.put(Part(moment.time_s, part[0]))
+                    self._ring.put(self.begun, Part(moment.time_s, part[0]))
         except (TypeError, ValueError, OverflowError, OSError) as error:  # control goes on, whatever is in it
             if not self._dropped:
                 log.error(

@@ -102,25 +102,21 @@ class Ring:
     def __init__(self, file: int | None = None, kept_s: float = KEPT_S, most_bytes: int = MAX_BYTES) -> None:
         self.file = os.memfd_create("tormagd", os.MFD_CLOEXEC) if file is None else file
         self._kept_s, self._most_bytes = kept_s, most_bytes // 2
-        self._begun, self._is_begun = Begin("", {}), False
+        self._begun: Begin | None = None
         self._half = self._at = self._bytes = 0
         self._first_s = math.inf
 
-    def begin(self, begun: Begin) -> None:
-        """Begin a scene: parts belong to the newest one before them."""
-        self._begun, self._is_begun = begun, False
-
-    def put(self, part: Part) -> None:
-        """Add a part, which comes later than those before."""
+    def put(self, begun: Begin, part: Part) -> None:
+        """Add a part, which comes later than those before, and what began its scene."""
         self._first_s = min(self._first_s, part.time_s)
         if part.time_s - self._first_s > self._kept_s or self._bytes + len(part.entries) > self._most_bytes:
             self._half = 1 - self._half
             self._at = HALVES[self._half]
             os.pwrite(self.file, END, self._at)
-            self._first_s, self._bytes, self._is_begun = part.time_s, 0, False
-        if not self._is_begun:
-            self._append(self._begun)
-            self._is_begun = True
+            self._first_s, self._bytes, self._begun = part.time_s, 0, None
+        if begun is not self._begun:
+            self._append(begun)
+            self._begun = begun
         self._append(part)
         self._bytes += len(part.entries)
 
