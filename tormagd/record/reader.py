@@ -11,15 +11,15 @@ import struct
 import zlib
 from collections import deque
 from collections.abc import Callable, Iterator
+from itertools import islice
 from pathlib import Path
 from typing import Any, BinaryIO, NamedTuple
 
 import msgspec
 from mcap.exceptions import McapError
-from mcap.reader import FOOTER_SIZE
+from mcap.reader import FOOTER_SIZE, SeekingReader
 from mcap.records import (
     Attachment,
-    AttachmentIndex,
     Channel,
     Chunk,
     ChunkIndex,
@@ -28,7 +28,6 @@ from mcap.records import (
     McapRecord,
     Message,
     Metadata,
-    MetadataIndex,
 )  # fmt: skip
 from mcap.stream_reader import MAGIC_SIZE, StreamReader, breakup_chunk
 from mcap.writer import MCAP0_MAGIC
@@ -60,8 +59,8 @@ MAX_RATIO, FREE_BYTES = 100, 16_000_000
 MAX_WINDOW_BYTES = 1 << 24
 DATA_END_BYTES = 13
 BLOCK_BYTES = 1 << 20
-MAX_INDEX = 1_000_000
-"Chunks of one file: some days."
+MAX_SUMMARY_BYTES = 64_000_000
+"The chunks of two days."
 MAX_SEEN = 400_000
 "Messages read at once: at 4 kHz more than a minute."
 END_NS = 2**64 - 1
@@ -103,15 +102,19 @@ def readable(name: str) -> Iterator[None]:
 
 
 class _Bounded:
-    """A file for an MCAP reader, which may read `left` more bytes."""
+    """A file for an MCAP reader, which may read `most` bytes of one place, and `left` more."""
 
-    def __init__(self, file: BinaryIO) -> None:
-        self._file, self.left = file, MAX_RECORD_BYTES
+    def __init__(self, file: BinaryIO, most: int = MAX_RECORD_BYTES) -> None:
+        self._file, self._most, self.left = file, most, most
+
+    def seek(self, at: int, whence: int = 0) -> int:
+        self.left = self._most
+        return self._file.seek(at, whence)
 
     def read(self, size: int) -> bytes:
         self.left -= size
         if self.left < 0:
-            raise ValueError(f"a record of over {MAX_RECORD_BYTES} bytes")
+            raise ValueError(f"records of over {self._most} bytes")
         data = self._file.read(size)
         if len(data) < size:
             raise EOFError("it ends within a record")
@@ -151,19 +154,18 @@ def _at(file: BinaryIO, at: int, kind: type[Any]) -> Any:
     return record
 
 
-def _end(file: BinaryIO) -> tuple[Footer | None, int]:
-    at = max(0, file.seek(0, 2) - FOOTER_SIZE - MAGIC_SIZE)
-    file.seek(at)
-    footer = _at(file, at, Footer) if file.read().endswith(MCAP0_MAGIC) else None
-    return (footer if footer and footer.summary_start else None), at
+def _is_ended(file: BinaryIO) -> bool:
+    file.seek(max(0, file.seek(0, 2) - MAGIC_SIZE))
+    return file.read() == MCAP0_MAGIC
 
 
 def damage_in(file: BinaryIO) -> str:
     """Say which CRC of a closed MCAP file is wrong; empty for none, and for a file cut short."""
     try:
-        footer, at = _end(file)
-        if footer is None:
+        if not _is_ended(file):
             return ""
+        at = max(0, file.seek(0, 2) - FOOTER_SIZE - MAGIC_SIZE)
+        footer = _at(file, at, Footer)
         data_end_at = footer.summary_start - DATA_END_BYTES
         if _at(file, data_end_at, DataEnd).data_section_crc not in (0, _crc(file, 0, data_end_at)):
             return "the CRC of its data is wrong"
@@ -210,22 +212,15 @@ class Contents:
 
     def _read_summary(self, file: BinaryIO) -> bool:
         """Read what stands at the end, and return whether all of that is there."""
-        told: list[int] = []
         with contextlib.suppress(*UNREADABLE):
-            footer, _ = _end(file)
-            if footer is None:
+            reader = SeekingReader(_Bounded(file, MAX_SUMMARY_BYTES), record_size_limit=MAX_RECORD_BYTES)  # type: ignore[arg-type]
+            summary = reader.get_summary()
+            if summary is None or not _is_ended(file):
                 return False
-            file.seek(footer.summary_start)
-            for record in _records(file):
+            for record in (*summary.channels.values(), *reader.iter_metadata(), *summary.chunk_indexes):
                 self._take(record, 0)
-                if isinstance(record, MetadataIndex):
-                    told.append(record.offset)
-                elif isinstance(record, AttachmentIndex) and record.name == OVERVIEW:
-                    self._overview_at = record.offset
-            for at in told:
-                self._take(_at(file, at, Metadata), at)
+            self._overview_at = next((each.offset for each in summary.attachment_indexes if each.name == OVERVIEW), 0)
             return True
-        self.places = []
         return False
 
     def _look_for_chunks(self, file: BinaryIO) -> None:
@@ -246,12 +241,12 @@ class Contents:
             self.topics[record.id] = record.topic
         elif isinstance(record, Metadata):
             self.metadata.update(record.metadata)
-        elif isinstance(record, Chunk | ChunkIndex) and len(self.places) < MAX_INDEX:
+        elif isinstance(record, Chunk | ChunkIndex):
             at = record.chunk_start_offset if isinstance(record, ChunkIndex) else at
             self.places.append(Place(record.message_start_time, record.message_end_time, at))
 
     def messages(self, file: BinaryIO, from_ns: int = 0, to_ns: int = END_NS) -> Iterator[Shown]:
-        """Yield the messages, undecoded, of the chunks that have some of this time, and are not damaged."""
+        """Yield the messages of this time, inclusive, undecoded, where their chunk is not damaged."""
         if not self.places:
             self._look_for_chunks(file)
         size = 0
@@ -269,7 +264,7 @@ class Contents:
                 continue
             for record in records:
                 self._take(record, place.at)
-                if isinstance(record, Message):
+                if isinstance(record, Message) and from_ns <= record.log_time <= to_ns:
                     topic = self.topics.get(record.channel_id, "")
                     yield Shown(topic, record.log_time, record.sequence, record.data)
 
@@ -342,13 +337,10 @@ class RecordingFile(Contents):
 
     def between(self, from_ns: int, to_ns: int, wanted: Any) -> list[Shown]:
         """Return the ticks and snapshots from `from_ns` to `to_ns`, inclusive, in the file's order."""
-        found: list[Shown] = []
         with opened(self.path) as file:
-            for seen in self.read(file, wanted, from_ns, to_ns):
-                if from_ns <= seen.t_ns <= to_ns:
-                    found.append(seen)
-                if len(found) > MAX_SEEN:
-                    raise ValueError(f"over {MAX_SEEN} messages in {(to_ns - from_ns) * 1e-9:.0f} s")
+            found = list(islice(self.read(file, wanted, from_ns, to_ns), MAX_SEEN + 1))
+            if len(found) > MAX_SEEN:
+                raise ValueError(f"over {MAX_SEEN} messages in {(to_ns - from_ns) * 1e-9:.0f} s")
         return found
 
 
@@ -372,8 +364,8 @@ class BlackBoxFile(Contents):
             damage = damage_in(file)
         if not self.entries:
             raise RecordingError(f"{path}: {NO_BLACK_BOX}")
-        if self._expected and self.is_complete:
-            self._note_other(self._expected[0])
+        if self._expected and self.is_complete and not self.lost:
+            self._compare(None, self._expected[0])
         self._note(damage)
 
     @property
@@ -383,9 +375,6 @@ class BlackBoxFile(Contents):
     def _note(self, odd: str) -> None:
         self.odd = self.odd or odd
 
-    def _note_other(self, shown: Shown) -> None:
-        self._note(f"message {shown.sequence} in {shown.topic} is not what {CORE_TOPIC} has")
-
     def _read_core(self, file: BinaryIO) -> None:
         """Keep the entries of `/core`, and compare what is derived of them, as far as no chunk is lost."""
         for sent in self.messages(file):
@@ -393,12 +382,13 @@ class BlackBoxFile(Contents):
                 return  # before all of a long recording has been read
             if sent.topic == CORE_TOPIC:
                 self._part(msgspec.json.decode(self.metadata.get("columns", "[]"), type=tuple[str, ...]), sent.message)
-            elif self.lost or self.odd:
-                self._expected.clear()
-            elif sent.topic in DERIVED:
-                expected = self._expected.popleft() if self._expected else None
-                if sent != expected:
-                    self._note_other(expected or sent)
+            elif sent.topic in DERIVED and not self.lost:
+                self._compare(sent, self._expected.popleft() if self._expected else None)
+
+    def _compare(self, sent: Shown | None, expected: Shown | None) -> None:
+        other = expected or sent
+        if other is not None and sent != expected:
+            self._note(f"message {other.sequence} in {other.topic} is not what {CORE_TOPIC} has")
 
     def _part(self, columns: tuple[str, ...], data: bytes) -> None:
         entries, self._size = msgspec.msgpack.decode(data, type=list[Any]), self._size + len(data)
@@ -407,7 +397,7 @@ class BlackBoxFile(Contents):
             return
         try:
             self._join([each[columns.index(NUMBER_COLUMN)] for each in entries if is_tick(each)])
-            for shown in self._derived.of(columns, entries):
+            for shown in () if self.lost else self._derived.of(columns, entries):
                 self._expected.append(shown._replace(message=msgspec.json.encode(shown.message)))
         except (ValueError, TypeError, AttributeError, OverflowError, LookupError) as error:
             self._note(f"{CORE_TOPIC}: {str(error)[:100]}")
