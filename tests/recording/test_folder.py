@@ -112,10 +112,12 @@ def test_a_folder_full_of_marked_recordings_is_full_and_says_so(tmp_path: Path, 
     assert len(folder.segments()) == 6
     # what stays free is for black boxes
     monkeypatch.setattr(shutil, "disk_usage", lambda path: SimpleNamespace(free=900_000))
-    assert "0.9 MB are free, and 1.0 stay so for black boxes" in folder.room(0)
+    with pytest.raises(OSError, match=r"0\.9 MB are free, and 1\.0 stay so for black boxes"):
+        folder.require_room(0)
     # what others fill is not made good by recordings
     unmarked = of_days(tmp_path, START_NS * 1e-9, -1, 0)
-    assert "nothing unmarked is left that would help" in folder.room(0)
+    with pytest.raises(OSError, match="nothing unmarked is left that would help"):
+        folder.require_room(0)
     assert all(path.exists() for path in unmarked)
 
 
@@ -211,7 +213,7 @@ def deadly(function, is_before):
     return call
 from tormagd.record import writer
 room, name = {
-    "rotate": (writer.RecordingWriter, "_rotate"), "begin": (writer.RecordingWriter, "_begin"),
+    "rotate": (writer.RecordingFolder, "new"), "begin": (writer.RecordingWriter, "_begin"),
     "prune": (Path, "unlink"), "mark": (Path, "rename"), "flush": (writer.Writer, "flush"),
     "finish": (writer.Writer, "finish"),
 }[what]
