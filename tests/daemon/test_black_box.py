@@ -21,7 +21,7 @@ from tormagd.daemon.profiles import state_folder
 from tormagd.ground.plain_values import plain
 from tormagd.hardware.connection import Connection
 from tormagd.hardware.streams import FrameStream
-from tormagd.record.keeper import Begin, End, Part, Ring, Write, Written, in_shared_memory
+from tormagd.record.keeper import End, Part, Ring, Write, Written, in_shared_memory
 from tormagd.record.stream import MAX_ENTRIES, PLAN, STEP, TEACH, Journal, Moment
 from tormagd.simulation.closed_loop import ClosedLoop
 from tormagd.simulation.device import VirtualDevice
@@ -88,14 +88,14 @@ def test_parts_have_the_ticks_in_their_order_and_a_state_every_second(rig: Rig) 
     rig.box.journal.note(PLAN, 1.0, TimedSetpoint(1.5, 1.0, 0.1))
     rig.tick(3_020)
     parts = rig.parts()
-    assert [begun for begun, _ in rig.ring.kept()] == [Begin("/boxes", {"format": "1"})] * len(parts)
+    assert [header for header, _ in rig.ring.kept()] == [{"format": "1", "folder": "/boxes"}] * len(parts)
     assert (names(parts[0])[:3], names(parts[0])[-3:]) == (["state", "step", "tick"], ["plan", "step", "tick"])
     assert [number for number, part in enumerate(parts) if "state" in names(part)] == [0, 100, 200, 300]
     assert [each for part in parts for each in names(part)].count("tick") == 3_015
     rig.box.begin_scene({"format": "2"}, rig.stepper, rig.planner)
     rig.tick(PART_TICKS)
-    begun, part = rig.ring.kept()[-1]
-    assert (begun, names(part)[:3]) == (Begin("/boxes", {"format": "2"}), ["missing", "state", "step"])
+    header, part = rig.ring.kept()[-1]
+    assert (header, names(part)[:3]) == ({"format": "2", "folder": "/boxes"}, ["missing", "state", "step"])
 
 
 def test_nothing_stays_of_what_was_handed_over(rig: Rig) -> None:
@@ -145,7 +145,7 @@ def test_a_request_waits_for_a_process_that_is_held_up(rig: Rig) -> None:
         while rig.its.recv(1_000) == b"x":
             pass
     rig.box.look()
-    assert rig.heard() == [Write(str(path), "SKEW", {"format": "1", "firmware": "1.0"})]
+    assert rig.heard() == [Write(str(path), "SKEW", {"format": "1", "folder": "/boxes", "firmware": "1.0"})]
     for written in (Written(path.name), Written("b.mcap", "No space left on device")):
         rig.its.send(msgspec.msgpack.encode(written))
         rig.box.look()

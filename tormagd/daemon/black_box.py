@@ -27,7 +27,6 @@ from tormagd.hardware.connection import Connection
 from tormagd.record.keeper import (
     REQUEST,
     SHARED_MEMORY,
-    Begin,
     End,
     Part,
     Ring,
@@ -85,7 +84,7 @@ class BlackBox:
     """Keeps the core's journal in a ring, from which the keeper, another process, writes black boxes into `folder`."""
 
     def __init__(self, folder: Path | None, header: dict[str, str], control_hz: int) -> None:
-        self._folder, self.begun = folder, Begin(str(folder), header)
+        self._folder, self.header = folder, header | {"folder": str(folder)}
         self._refusal, self._newest, self._dropped = "", "", 0
         self._beside: ChildProcess | None = None
         self._ring: Ring | None = None
@@ -114,7 +113,7 @@ class BlackBox:
 
     def begin_scene(self, header: dict[str, str], stepper: Stepper, planner: Planner) -> None:
         """Begin anew with the core of another scene, from a snapshot of these states."""
-        self.begun = Begin(str(self._folder), header)
+        self.header = header | {"folder": str(self._folder)}
         self._begin_anew(stepper, planner)
 
     def ticked(self, moment: Moment, stepper: Stepper, planner: Planner) -> tuple[bytes, list[Any]] | None:
@@ -132,7 +131,7 @@ class BlackBox:
                 entries = self.journal.take()
                 part = packed(entries), [each for each in entries if isinstance(each, msgspec.Raw)]
                 if self._ring is not None:
-                    self._ring.put(self.begun, Part(moment.time_s, part[0]))
+                    self._ring.put(self.header, Part(moment.time_s, part[0]))
         except (TypeError, ValueError, OverflowError, OSError) as error:  # control goes on, whatever is in it
             if not self._dropped:
                 log.error(
@@ -162,7 +161,7 @@ class BlackBox:
             raise RefusedError("busy", self._refusal, "ask again in a few seconds")
         path = box_path(str(self._folder), reason)
         self._refusal = ""
-        self._unwritten[path.name] = time.monotonic() + after_s, Write(str(path), reason, self.begun.header | details)
+        self._unwritten[path.name] = time.monotonic() + after_s, Write(str(path), reason, self.header | details)
         self._ask()
         return path
 
@@ -238,7 +237,7 @@ class BlackBox:
     def _snapshot(self, stepper: Stepper, planner: Planner) -> None:
         if self.journal.is_kept:
             memory = None if self._connection is None else self._connection.memory()
-            core = self.begun.header.get("core_sha256", "")
+            core = self.header.get("core_sha256", "")
             self.journal.note(STATE, plain(stepper), plain(planner), memory, core)
 
     def _wait(self, reason: str) -> None:

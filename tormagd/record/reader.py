@@ -95,10 +95,8 @@ def readable(name: str) -> Iterator[None]:
     """Turn any of UNREADABLE into a RecordingError that names the file."""
     try:
         yield
-    except RecordingError:
-        raise
     except UNREADABLE as error:
-        raise RecordingError(f"{name}: not an intact MCAP file ({str(error)[:200]})") from error
+        raise RecordingError(f"{name}: not an intact MCAP file of tormagd ({str(error)[:200]})") from error
 
 
 class _Bounded:
@@ -195,8 +193,7 @@ class Place(NamedTuple):
 class Contents:
     """What is in an MCAP file: topics, metadata, where its chunks are, and which of those read are damaged."""
 
-    def __init__(self, file: BinaryIO, name: str) -> None:
-        self._name = name
+    def __init__(self, file: BinaryIO) -> None:
         self.topics: dict[int, str] = {}
         self.metadata: dict[str, str] = {}
         self.places: list[Place] = []
@@ -280,8 +277,7 @@ class Contents:
 
     def _require_topics(self) -> None:
         if set(self.topics.values()).isdisjoint(TOPICS):
-            said = f"no channel {TELEMETRY_TOPIC} or {TICKS_TOPIC} in it; `tormagctl record` makes one"
-            raise RecordingError(f"{self._name}: {said}")
+            raise ValueError(f"no channel {TELEMETRY_TOPIC} or {TICKS_TOPIC} in it; `tormagctl record` makes one")
 
     def read_overview(self, file: BinaryIO) -> Overview | None:
         """Read the overview of a closed file, if there is one."""
@@ -300,7 +296,7 @@ class Contents:
 def read_open(file: BinaryIO, name: str, wanted: Any, each: Callable[[Shown], None]) -> Contents:
     """Read an open recording: each tick and snapshot goes to `each`."""
     with readable(name):
-        found = Contents(file, name)
+        found = Contents(file)
         for seen in found.read(file, wanted):
             each(seen)
     return found
@@ -318,7 +314,7 @@ class RecordingFile(Contents):
     def __init__(self, path: Path) -> None:
         self.path, self.name = path, printable(path.name)
         with opened(path) as file:
-            super().__init__(file, str(path))
+            super().__init__(file)
             self.damage = damage_in(file)
             overview = None if self.damage else self.read_overview(file)
             if overview is None:
@@ -359,7 +355,7 @@ class BlackBoxFile(Contents):
         self._derived, self._size = Derived(), 0
         self._tick: int | None = None
         with opened(path) as file:
-            super().__init__(file, str(path))
+            super().__init__(file)
             self._read_core(file)
             damage = damage_in(file)
         if not self.entries:
@@ -413,4 +409,4 @@ class BlackBoxFile(Contents):
 def overview_of(path: Path) -> Overview | None:
     """Read the overview at the end of the file, if there is one."""
     with opened(path) as file:
-        return Contents(file, str(path)).read_overview(file)
+        return Contents(file).read_overview(file)

@@ -20,7 +20,7 @@ from tormagd.config import Config, Device, checked
 from tormagd.control.assembly.build import Core, build_core, platform_name, sources_hash
 from tormagd.control.believe.sensor import Disputed
 from tormagd.control.core import PLAN_ERRORS
-from tormagd.control.records import Duty, TimedSetpoint
+from tormagd.control.records import Duty, Plan, TimedSetpoint
 from tormagd.control.safety.codes import Fault, Limit
 from tormagd.control.safety.operating_state import RefusedError
 from tormagd.ground.plain_values import first_difference, kinds, packed, plain, restore, restored
@@ -297,13 +297,12 @@ class _Running:
     def __init__(self, core: Core) -> None:
         self._core = stream.core_hash(core.config, core.scene, core.model)
         self._stepper, self._planner = core.stepper(), core.planner()
-        self._used = self._planner.planned
+        self._ran: tuple[Duty, Plan, Measurement | None] | None = None
+        "Output, plan and measurement of the newest step."
         self._link: Conversation | None = None
         self._of_frames: list[tuple[str, Any, Any, int]] = []
         "What the frames give, as recorded and replayed: a tick's columns are compared before."
         self._failure: Exception | None = None
-        self._output: Duty | None = None
-        self._measurement: Measurement | None = None
         self.is_known = False
         self.frame = self.frames = self.snapshots = self.gaps = 0
 
@@ -363,17 +362,16 @@ class _Running:
                 raise ValueError(f"{name[:40]!r}: no entry of a black box")
 
     def _step(self, record: Any) -> None:
-        self._measurement = stream.measurement_of(record)
-        if self._link is not None:
-            told, own = plain(self._measurement), plain(self._link.connection.measurement)
-            self._of_frames = [("measurement", told, own, self.frame)]
-        self._used = self._planner.planned
-        self._output = self._stepper.step(record.monotonic_s, self._measurement, self._used)
+        measurement, plan = stream.measurement_of(record), self._planner.planned
+        told = plain(measurement)
+        own = told if self._link is None else plain(self._link.connection.measurement)
+        self._of_frames = [("measurement", told, own, self.frame)]
+        self._ran = self._stepper.step(record.monotonic_s, measurement, plan), plan, measurement
 
     def _write(self, link: Conversation, now_s: float, recorded: list[Any], unsent: int) -> None:
-        if self._output is None:
+        if self._ran is None:
             raise ValueError("something written without a step")
-        pairs = zip_longest(recorded, link.write(now_s, unsent, self._output))
+        pairs = zip_longest(recorded, link.write(now_s, unsent, self._ran[0]))
         for number, (told, own) in enumerate(pairs, self.frame - len(recorded) + 1):
             self._of_frames.append(("written", _shown(told), _shown(own), number))
 
@@ -388,12 +386,11 @@ class _Running:
 
     def _compare(self, record: Any) -> None:
         """Compare what is run with the recorded tick, column by column, and then what its frames gave."""
-        if self._output is None:
+        if self._ran is None:
             raise ValueError("a tick without a step")
         if self._failure is not None:
             raise DifferenceError(Found("plan", "made", f"failed: {self._failure}"))
-        timing = record.lateness_us, record.exec_us, record.tick
-        given = stream.Moment(self._stepper, self._output, self._used, self._measurement, *timing).row()
+        given = stream.Moment(self._stepper, *self._ran, record.lateness_us, record.exec_us, record.tick).row()
         left, right = msgspec.structs.astuple(record)[NOT_THE_CORES:], msgspec.structs.astuple(given)[NOT_THE_CORES:]
         if packed(left) != packed(right):
             rows = zip(stream.COLUMNS[NOT_THE_CORES:], left, right, strict=True)

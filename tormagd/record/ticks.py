@@ -44,8 +44,6 @@ def encode_ticks(rows: Sequence[object], columns: tuple[str, ...] = COLUMNS, cor
 
 
 def decode_ticks(data: bytes) -> TickBatch:
-    if len(data) > MAX_BATCH_BYTES:
-        raise MessageError(f"tick batch of {len(data)} bytes: allowed is {MAX_BATCH_BYTES}")
     try:
         return _DECODER.decode(data)
     except (msgspec.MsgspecError, RecursionError, UnicodeDecodeError) as error:
