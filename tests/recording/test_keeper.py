@@ -34,7 +34,11 @@ PATIENCE_S = 60.0
 HEADER = {"format": "0", "scene": "a", "columns": json.dumps(["t_ns", "x"])}
 
 
-OF_BOXES = HEADER | {"folder": "/boxes"}
+def headed(folder: Path | str, scene: str = "a") -> dict[str, str]:
+    return HEADER | {"folder": str(folder), "scene": scene}
+
+
+OF_BOXES = headed("/boxes")
 
 
 def part(time_s: float, size: int = 100) -> Part:
@@ -144,7 +148,7 @@ def process(tmp_path: Path) -> Iterator[Process]:
 
 def written(folder: Path, name: str, **header: str) -> Write:
     reason = name.removesuffix(".mcap").rpartition("-")[2]
-    return Write(str(folder / name), reason, HEADER | header | {"folder": str(folder)})
+    return Write(str(folder / name), reason, headed(folder) | header)
 
 
 def ticks(first: int, count: int) -> Part:
@@ -160,7 +164,7 @@ def test_it_writes_what_it_is_told_and_what_a_dead_daemon_left(process: Process,
         (folder / f"20200101T0000{number:02d}.000Z-REQUEST.mcap").touch()
     (folder / "20200101T000000.000Z-SKEW-to-keep.mcap").touch()
     (folder / "20200101T000000.000Z-SKEW.mcap").mkdir()
-    process.say(HEADER | {"folder": str(folder)}, ticks(1, 20), ticks(21, 20))
+    process.say(headed(folder), ticks(1, 20), ticks(21, 20))
     process.say(written(folder, "20300101T000000.000Z-SKEW.mcap", firmware="1.2"))
     assert process.heard() == Written("20300101T000000.000Z-SKEW.mcap")
     box = BlackBoxFile(folder / "20300101T000000.000Z-SKEW.mcap")
@@ -178,15 +182,13 @@ def test_it_writes_what_it_is_told_and_what_a_dead_daemon_left(process: Process,
     process.say(written(folder / "20300101T000000.000Z-SKEW.mcap", "x-SKEW.mcap"))
     assert "x-SKEW.mcap" in process.heard().refusal
     # what is asked for late is of the scene that its header names
-    process.say(HEADER | {"scene": "b", "folder": str(folder)}, Part(0.05, b"\xc1"))
-    process.say(written(folder, "20300102T000000.000Z-DUE.mcap"))
+    process.say(headed(folder, "b"), Part(0.05, b"\xc1"), written(folder, "20300102T000000.000Z-DUE.mcap"))
     assert process.heard().refusal == ""
     # so does a part that is none
     process.say(written(folder, "y-SKEW.mcap", scene="b"))
     assert process.heard().refusal.startswith(f"{folder}/y-SKEW.mcap: DecodeError")
     # no word, no daemon: it was killed. Each beginning is of another scene, and keeps nothing of the one before
-    process.say(HEADER | {"scene": "c", "folder": str(folder)}, ticks(61, 20))
-    process.say(written(folder, "2031Z-LATER.mcap", scene="c"))
+    process.say(headed(folder, "c"), ticks(61, 20), written(folder, "2031Z-LATER.mcap", scene="c"))
     process.die()
     assert process.child.wait(PATIENCE_S) == 0
     (left,) = folder.glob(f"*{DIED}.mcap")
@@ -197,7 +199,7 @@ def test_it_writes_what_it_is_told_and_what_a_dead_daemon_left(process: Process,
 
 @pytest.mark.parametrize("is_daemon_killed", [True, False], ids=["both were killed", "the keeper was killed"])
 def test_what_a_killed_keeper_had_is_there_after_it(process: Process, tmp_path: Path, is_daemon_killed: bool) -> None:
-    process.say(HEADER | {"folder": str(tmp_path)}, ticks(1, 20))
+    process.say(headed(tmp_path), ticks(1, 20))
     process.child.kill()
     process.child.wait()
     if is_daemon_killed:
@@ -205,7 +207,7 @@ def test_what_a_killed_keeper_had_is_there_after_it(process: Process, tmp_path: 
         after = Process(tmp_path)
     else:
         after = Process(tmp_path, process.ring)
-    after.say(HEADER | {"folder": str(tmp_path)}, ticks(21, 20), written(tmp_path, "2Z-Y.mcap"))
+    after.say(headed(tmp_path), ticks(21, 20), written(tmp_path, "2Z-Y.mcap"))
     while after.heard().name != "2Z-Y.mcap":
         pass
     after.say(End())
@@ -236,7 +238,7 @@ def test_another_s_files_are_not_taken(tmp_path: Path, monkeypatch: pytest.Monke
 
 @pytest.mark.parametrize("words", [(), (ticks(1, 20), End())], ids=["gone before it kept anything", "ended in order"])
 def test_it_ends_with_the_daemon_and_leaves_nothing(process: Process, tmp_path: Path, words: tuple[Any, ...]) -> None:
-    process.say(HEADER | {"folder": str(tmp_path / "boxes")}, *words)
+    process.say(headed(tmp_path / "boxes"), *words)
     process.die()
     assert process.child.communicate(timeout=PATIENCE_S) == (None, "")
     assert not (tmp_path / "boxes").exists()

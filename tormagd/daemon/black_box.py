@@ -58,7 +58,7 @@ AFTER_FAULT_S = 2.0
 LEAVING_S, AGAIN_S = 2.0, 1.0
 "How long the end of a keeper is waited for, and how soon one that has ended is replaced."
 MAX_REQUESTED, MAX_OF_FAULTS = 8, 20
-"Boxes that are still to be written, at most: those that somebody asked for, and those of faults."
+"Boxes still to be written, at most: requested ones, and those of faults."
 
 log = logging.getLogger(__name__)
 
@@ -90,9 +90,9 @@ class BlackBox:
         self._ring: Ring | None = None
         self._due_s, self.is_heard = 0.0, False
         self._unwritten: dict[str, tuple[float, Write]] = {}
-        "By name: when it is due, and what the keeper is to write. A new keeper is asked for all of it."
+        "By name, with the time when it is due. A new keeper is asked for all of it."
         self._asked = ""
-        "The name of what the keeper was last asked for."
+        "What the keeper was last asked for, by name."
         if folder is None:
             self._refusal = "no folder is named for black boxes"
         elif importlib.util.find_spec("mcap") is None:
@@ -146,7 +146,7 @@ class BlackBox:
         return part
 
     def write(self, reason: str, after_s: float, details: dict[str, str]) -> Path:
-        """Have a black box written in `after_s`, and return the path that it will have."""
+        """Have a black box written in `after_s`, and return its path."""
         if self._ring is None:
             raise RefusedError(
                 "no_black_box",
@@ -154,10 +154,9 @@ class BlackBox:
                 "name [black_box] folder in the daemon's configuration, and start it again",
             )
         is_requested = reason == REQUEST
-        alike = [asked for _, asked in self._unwritten.values() if (asked.reason == REQUEST) is is_requested]
-        most = MAX_REQUESTED if is_requested else MAX_OF_FAULTS
-        if len(alike) >= most:
-            self._refusal = f"{most} black boxes are still to be written"
+        alike = sum((asked.reason == REQUEST) is is_requested for _, asked in self._unwritten.values())
+        if alike >= (MAX_REQUESTED if is_requested else MAX_OF_FAULTS):
+            self._refusal = f"{alike} black boxes are still to be written"
             raise RefusedError("busy", self._refusal, "ask again in a few seconds")
         path = box_path(str(self._folder), reason)
         self._refusal = ""
@@ -210,20 +209,18 @@ class BlackBox:
         if self._ring is not None:
             self._ring.path.unlink(missing_ok=True)
         if (beside := self._beside) is not None:
-            for name, (_, asked) in self._unwritten.items():
-                if name != self._asked:
-                    beside.send(msgspec.msgpack.encode(asked))
+            for _, asked in self._unwritten.values():
+                beside.send(msgspec.msgpack.encode(asked))
             beside.send(msgspec.msgpack.encode(End()))
             beside.close()
             with contextlib.suppress(subprocess.TimeoutExpired):
                 beside.process.wait(LEAVING_S)
 
     def _ask(self) -> None:
-        """Ask the keeper for the next box that is due, a fault's first, once it has written the one before."""
+        """Ask the keeper for the next box that is due, faults' first, after the one before."""
         if self._beside is None or self._asked in self._unwritten:
             return
-        now_s = time.monotonic()
-        due = [asked for due_s, asked in self._unwritten.values() if due_s <= now_s]
+        due = [asked for due_s, asked in self._unwritten.values() if due_s <= time.monotonic()]
         due.sort(key=lambda asked: asked.reason == REQUEST)
         if due and self._beside.send(msgspec.msgpack.encode(due[0])):
             self._asked = Path(due[0].path).name

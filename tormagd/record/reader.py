@@ -243,7 +243,7 @@ class Contents:
             self.places.append(Place(record.message_start_time, record.message_end_time, at))
 
     def messages(self, file: BinaryIO, from_ns: int = 0, to_ns: int = END_NS) -> Iterator[Shown]:
-        """Yield the messages of this time, inclusive, undecoded, where their chunk is not damaged."""
+        """Yield the messages, undecoded, of the chunks that have some of this time, and are not damaged."""
         if not self.places:
             self._look_for_chunks(file)
         size = 0
@@ -261,15 +261,15 @@ class Contents:
                 continue
             for record in records:
                 self._take(record, place.at)
-                if isinstance(record, Message) and from_ns <= record.log_time <= to_ns:
+                if isinstance(record, Message):
                     topic = self.topics.get(record.channel_id, "")
                     yield Shown(topic, record.log_time, record.sequence, record.data)
 
-    def read(self, file: BinaryIO, wanted: Any, *times_ns: int) -> Iterator[Shown]:
-        """Yield the ticks and snapshots of `messages`, decoded as `wanted`."""
+    def read(self, file: BinaryIO, wanted: Any, from_ns: int = 0, to_ns: int = END_NS) -> Iterator[Shown]:
+        """Yield the ticks and snapshots from `from_ns` to `to_ns`, inclusive, decoded as `wanted`."""
         decode = msgspec.json.Decoder(wanted).decode
-        for topic, t_ns, sequence, data in self.messages(file, *times_ns):
-            if topic in TOPICS:
+        for topic, t_ns, sequence, data in self.messages(file, from_ns, to_ns):
+            if topic in TOPICS and from_ns <= t_ns <= to_ns:
                 yield Shown(topic, t_ns, sequence, decode(data))
         if len(self.lost) == len(self.places) > 0:
             raise ValueError(next(iter(self.lost.values())))

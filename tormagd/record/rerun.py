@@ -323,7 +323,7 @@ class _Running:
             self._compare(record)
 
     def _take(self, name: str, entry: Any, record: Any) -> None:
-        """Do what one entry tells."""
+        """Do what one entry tells: a step, something of the link, or something of the core."""
         match name:
             case stream.STEP:
                 self._step(record)
@@ -333,12 +333,18 @@ class _Running:
                 self._link.read(*entry[1:])
             case connection.WROTE if self._link is not None:
                 self._write(self._link, *entry[1:])
+            case stream.LOSE_LINK:
+                self._stepper.lose_link()
+            case stream.TOLD:
+                pass
+            case _:
+                self._run(name, entry)
+
+    def _run(self, name: str, entry: Any) -> None:
+        """Do what one entry of the core tells: plan, learning, command or fault."""
+        match name:
             case stream.PLAN:
-                now_s, timed = planned_for(entry)
-                try:
-                    self._planner.plan(now_s, timed, self._stepper.measured, self._stepper.is_followed)
-                except PLAN_ERRORS as error:
-                    self._failure = error
+                self._plan(*planned_for(entry))
             case stream.FORESEE:
                 self._planner.governor.foresee()
             case stream.AFRESH:
@@ -354,12 +360,14 @@ class _Running:
                 self._command(*msgspec.convert(entry[1:], tuple[str, float, bool, dict[str, Any]]))
             case stream.LATCH:
                 self._stepper.latch(Fault(entry[1]))
-            case stream.LOSE_LINK:
-                self._stepper.lose_link()
-            case stream.TOLD:
-                pass
             case _:
                 raise ValueError(f"{name[:40]!r}: no entry of a black box")
+
+    def _plan(self, now_s: float, timed: TimedSetpoint | None) -> None:
+        try:
+            self._planner.plan(now_s, timed, self._stepper.measured, self._stepper.is_followed)
+        except PLAN_ERRORS as error:
+            self._failure = error
 
     def _step(self, record: Any) -> None:
         measurement, plan = stream.measurement_of(record), self._planner.planned
