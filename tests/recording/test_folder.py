@@ -9,6 +9,7 @@ import sys
 import time
 from pathlib import Path
 from types import SimpleNamespace
+from unittest.mock import Mock
 
 import pytest
 from mcap.writer import MCAP0_MAGIC
@@ -157,6 +158,15 @@ def test_a_recorder_whose_budget_is_full_ends_its_segment_in_order(tmp_path: Pat
     known = RecordingFile(writer.path)
     assert (known.is_complete, [each.text for each in known.overview.marks]) == (False, ["here"])
     assert known.damage == ""
+
+
+def test_a_segment_is_ended_in_order_whatever_keeps_the_next_from_beginning(tmp_path: Path, monkeypatch) -> None:
+    recorder = RecordingWriter(RecordingFolder(tmp_path, SETTINGS, Clock()))
+    monkeypatch.setattr(RecordingFolder, "new", Mock(side_effect=PermissionError(13, "Permission denied")))
+    with pytest.raises(OSError, match="Permission denied"), recorder:
+        recorder.ticks(batch((0, 1.0, 1.0, 35.0, 36.0, 0.25), (3.7e6, 1.0, 1.0, 35.0, 36.0, 0.25)))
+    known = RecordingFile(recorder.path)
+    assert (known.overview.ticks, known.notes) == (2, ["cut short: Permission denied"])
 
 
 def record(path: Path, clock: Clock, hours: int, rng: random.Random) -> list[str]:

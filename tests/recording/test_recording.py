@@ -388,6 +388,13 @@ def test_a_thinned_recording_has_all_around_a_fault_and_a_mark_and_says_so(tmp_p
     assert RecordingFile(path).overview.ticks == 30_000
 
 
+def test_all_is_kept_around_a_mark_that_was_made_just_before_the_file(tmp_path: Path) -> None:
+    with RecordingWriter(tmp_path / "a.mcap", every=50) as writer:
+        tell(writer, telemetry(0, 0, mark=Mark(t_ns=START_NS - 10_000_000, text="here")))
+        writer.ticks(batch(*(row(k) for k in range(500)), columns=ALL_COLUMNS))
+    assert len(back(writer.path).ticks) == 500
+
+
 @pytest.mark.parametrize(
     "change",
     [

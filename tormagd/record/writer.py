@@ -189,6 +189,7 @@ class RecordingWriter:
         if every > 1:
             self._about[THINNED] = f"one tick of {every}; all within {AROUND_S:g} s of a fault or a mark"
         self._last_tick: int | None = None
+        self._mark: Mark | None = None
         self.telemetry_count = self.tick_count = self.ticks_lost = self.restarts = 0
         self._begin(place.new() if isinstance(place, RecordingFolder) else place)
 
@@ -220,7 +221,10 @@ class RecordingWriter:
         self.entries(batch.columns, entries, core)
         lasts_s = (self._chunk_ns - self._begin_ns) * 1e-9
         if self._folder is not None and self._folder.is_due(self._file.tell(), lasts_s):
-            path = self._folder.new()
+            try:
+                path = self._folder.new()
+            except OSError as error:  # what is written is ended in order, whatever the reason
+                raise NoRoomError(error.errno, error.strerror) from error
             self._end()
             self._begin(path)
 
@@ -238,10 +242,10 @@ class RecordingWriter:
         self._add(shown)
         self.telemetry_count += 1
         mark = msgspec.convert(shown.message.get("mark"), Mark | None)
-        if not self._overview.add(shown.t_ns, False, {"mark": mark}):
-            return
-        self._thinning.happened(shown.t_ns)
-        if self._folder is not None:
+        if mark not in (None, self._mark):  # every snapshot has the newest, which may be from before this file
+            self._thinning.happened(shown.t_ns)
+            self._mark = mark
+        if self._overview.add(shown.t_ns, False, {"mark": mark}) and self._folder is not None:
             try:
                 self.path = self._folder.mark_around(self.path)
             except (OSError, ValueError) as error:  # somebody has renamed it
