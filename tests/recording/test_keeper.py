@@ -57,8 +57,10 @@ def test_the_ring_keeps_half_a_minute_of_a_day() -> None:
     ring = Ring()
     for number in range(10_000):
         ring.put(OF_BOXES, part(0.02 * number))
-    parts = parts_in(ring)
-    assert parts[-1].time_s - parts[0].time_s == pytest.approx(KEPT_S, abs=0.021)
+    kept = ring.kept()
+    (of_first, first), (of_last, last) = kept[0], kept[-1]
+    assert last.time_s - first.time_s == pytest.approx(KEPT_S, abs=0.021)
+    assert of_first == of_last == OF_BOXES  # which each half begins with
 
 
 def test_the_ring_holds_no_more_bytes_than_it_may() -> None:

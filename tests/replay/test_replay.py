@@ -196,6 +196,18 @@ def test_a_command_that_is_missing_is_found(core: Core, box: BlackBoxFile) -> No
 
 
 @pytest.mark.parametrize(
+    ("was_refused", "recorded", "replayed"), [(True, "refused", "taken"), (False, "taken", "refused: ")]
+)
+def test_a_command_that_is_now_taken_or_refused_is_found(
+    core: Core, box: BlackBoxFile, was_refused: bool, recorded: str, replayed: str
+) -> None:
+    place = next(n for n, it in enumerate(box.entries) if it[0] == "command" and it[3] is not was_refused)
+    found = rerun(core, altered(box.entries, place, 3, was_refused)).difference
+    assert (found.field, found.recorded) == (box.entries[place][1], recorded)
+    assert found.replayed.startswith(replayed)
+
+
+@pytest.mark.parametrize(
     "edit",
     [
         lambda shown: shown._replace(message=shown.message | {"operating_state": "ENABLED"}),
@@ -223,6 +235,14 @@ def test_what_people_see_is_what_replays_or_is_named(path: Path, tmp_path: Path,
     write_black_box(tmp_path / "edited.mcap", box.metadata, [msgspec.msgpack.encode(head)])
     monkeypatch.undo()
     assert BlackBoxFile(tmp_path / "edited.mcap").odd == "message 300 in /ticks is not what /core has"
+
+
+def test_a_message_that_is_missing_at_the_end_is_named(box: BlackBoxFile, tmp_path: Path, monkeypatch: Any) -> None:
+    head, derived = box.entries[: list(ticks_of(box.entries))[60] + 1], Derived.of
+    monkeypatch.setattr(Derived, "of", lambda *told: list(derived(*told))[:-1])
+    write_black_box(tmp_path / "short.mcap", box.metadata, [msgspec.msgpack.encode(head)])
+    monkeypatch.undo()
+    assert BlackBoxFile(tmp_path / "short.mcap").odd == "message 60 in /ticks is not what /core has"
 
 
 def test_the_sources_hash_is_of_every_room(monkeypatch: pytest.MonkeyPatch) -> None:
