@@ -148,8 +148,9 @@ def _record(
         "silent_ms": round(silent_s * 1e3, 3),
         "unreadable": unreadable,
     }
-    text = f"{writer.path}: {writer.tick_count} ticks, {writer.telemetry_count} snapshots"
-    text += f"; {writer.ticks_lost} ticks lost"
+    text = (
+        f"{writer.path}: {writer.tick_count} ticks, {writer.telemetry_count} snapshots; {writer.ticks_lost} ticks lost"
+    )
     if writer.restarts:
         text += f"; the daemon began anew {writer.restarts} times, and nothing is known of between"
     if silent_s > SILENT_S:

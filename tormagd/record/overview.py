@@ -145,9 +145,6 @@ class Overview(msgspec.Struct, frozen=True, kw_only=True):
         known = self.codes.get(kind, {})
         return {code: [(a * 1e-9, b * 1e-9) for a, b in each.spans_ns] for code, each in known.items()}
 
-    def packed(self) -> bytes:
-        return msgspec.msgpack.encode(self)
-
 
 def unpacked(data: bytes) -> Overview:
     require(len(data) <= MAX_BYTES, "its overview", len(data), f"{MAX_BYTES} bytes")

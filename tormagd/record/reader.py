@@ -38,7 +38,6 @@ from tormagd.record.stream import MISSING
 from tormagd.record.writer import (
     CORE_TOPIC,
     CUT,
-    FRAMES_TOPIC,
     NUMBER_COLUMN,
     OVERVIEW,
     TELEMETRY_TOPIC,
@@ -66,9 +65,7 @@ MAX_SEEN = 400_000
 END_NS = 2**64 - 1
 MAX_CORE_BYTES, MAX_ENTRIES = 50_000_000, 1_000_000
 "Bounds on what is read of one file, a minute of 1 kHz; what comes after is passed over."
-NO_BLACK_BOX = f"no black box of tormagd: it has nothing in {CORE_TOPIC}, or not what a replay needs"
 TOPICS = (TELEMETRY_TOPIC, TICKS_TOPIC)
-DERIVED = (*TOPICS, FRAMES_TOPIC)
 UNREADABLE = (
     McapError, ZstdError, EOFError, ValueError, OverflowError, MemoryError, RecursionError, struct.error,
     msgspec.MsgspecError,
@@ -359,9 +356,10 @@ class BlackBoxFile(Contents):
             self._read_core(file)
             damage = damage_in(file)
         if not self.entries:
-            raise RecordingError(f"{path}: {NO_BLACK_BOX}")
+            said = f"no black box of tormagd: it has nothing in {CORE_TOPIC}, or not what a replay needs"
+            raise RecordingError(f"{path}: {said}")
         if self._expected and self.is_complete and not self.lost:
-            self._compare(None, self._expected[0])
+            self._compare(self._expected[0], None)
         self._note(damage)
 
     @property
@@ -378,12 +376,12 @@ class BlackBoxFile(Contents):
                 return  # before all of a long recording has been read
             if sent.topic == CORE_TOPIC:
                 self._part(msgspec.json.decode(self.metadata.get("columns", "[]"), type=tuple[str, ...]), sent.message)
-            elif sent.topic in DERIVED and not self.lost:
+            elif not self.lost:
                 self._compare(sent, self._expected.popleft() if self._expected else None)
 
-    def _compare(self, sent: Shown | None, expected: Shown | None) -> None:
-        other = expected or sent
-        if other is not None and sent != expected:
+    def _compare(self, sent: Shown, expected: Shown | None) -> None:
+        if sent != expected:
+            other = expected or sent
             self._note(f"message {other.sequence} in {other.topic} is not what {CORE_TOPIC} has")
 
     def _part(self, columns: tuple[str, ...], data: bytes) -> None:

@@ -13,8 +13,7 @@ from typing import Any, NamedTuple
 import msgspec
 
 from firmware_protocol.build import settle
-from firmware_protocol.codec import DeviceFault, DeviceMode, Identity, Message, Sense, State, Status, Switches
-from firmware_protocol.framing import Frame, FramingStatistics
+from firmware_protocol.codec import Message
 from tormagd import __version__
 from tormagd.config import Config, Device, checked
 from tormagd.control.assembly.build import Core, build_core, platform_name, sources_hash
@@ -23,12 +22,10 @@ from tormagd.control.core import PLAN_ERRORS
 from tormagd.control.records import Duty, Plan, TimedSetpoint
 from tormagd.control.safety.codes import Fault, Limit
 from tormagd.control.safety.operating_state import RefusedError
-from tormagd.ground.plain_values import first_difference, kinds, packed, plain, restore, restored
+from tormagd.ground.plain_values import first_difference, packed, plain, restore, restored
 from tormagd.hardware import connection
 from tormagd.hardware.backend import BackendError, Sent, Stream
-from tormagd.hardware.link import LinkState
-from tormagd.hardware.link_statistics import LinkQuality
-from tormagd.hardware.measurement import DeviceRequest, Measurement
+from tormagd.hardware.measurement import Measurement
 from tormagd.hardware.streams import CanStream, FrameStream, SecondHostError
 from tormagd.record import stream
 from tormagd.record.reader import BlackBoxFile
@@ -127,12 +124,6 @@ def differences(header: dict[str, str]) -> list[str]:
     return found
 
 
-KNOWN_OF_LINK = kinds(
-    *(LinkState, DeviceRequest, Identity, State, Sense, Status, DeviceMode, Switches, DeviceFault),
-    *(LinkQuality, Frame, FramingStatistics),
-)
-
-
 class Found(msgspec.Struct, frozen=True):
     """The first difference: its field, both values, and the frame that it belongs to. `tick` counts from 1, `time_s`
     from the file's first tick."""
@@ -167,7 +158,7 @@ class Conversation:
         self._written: list[Sent] = []
         self.connection = connection.Connection(Device(), lambda: self, lambda: None)
         self.connection.open(0.0)
-        self.connection.remember(memory, KNOWN_OF_LINK)
+        self.connection.remember(memory, stream.KNOWN)
 
     def read(self, now_s: float, raw: Any) -> None:
         self._unread = raw if isinstance(raw, list) else [raw]

@@ -215,10 +215,11 @@ class RecordingWriter:
         self._mcap.add_metadata(ABOUT, metadata)
 
     def ticks(self, batch: TickBatch) -> None:
-        """Write a batch; of ticks that are thinned, nothing for a replay."""
-        core = batch.core if self._thinning.every == 1 else b""
-        entries = msgspec.msgpack.decode(core, type=list[Any]) if core else [list(row) for row in batch.rows]
-        self.entries(batch.columns, entries, core)
+        """Write a batch, and end the file where it is due."""
+        entries = [list(row) for row in batch.rows]
+        if batch.core:
+            entries = msgspec.msgpack.decode(batch.core, type=list[Any])
+        self.entries(batch.columns, entries, batch.core)
         lasts_s = (self._chunk_ns - self._begin_ns) * 1e-9
         if self._folder is not None and self._folder.is_due(self._file.tell(), lasts_s):
             try:
@@ -229,10 +230,12 @@ class RecordingWriter:
             self._begin(path)
 
     def entries(self, columns: Sequence[str], entries: Sequence[Any], core: bytes) -> None:
-        """Write `core`, which has these entries, and then what is derived of them."""
+        """Write `core`, which has these entries, and then what is derived of them; thinned, nothing for a replay."""
         self._schemas[TICKS_TOPIC] = TICK_SCHEMA if set(columns) <= set(COLUMNS) else OTHER_SCHEMA
         shown = list(self._derived.of(columns, entries))
-        if core:
+        if self._thinning.every > 1:
+            shown = [each for each in shown if each.topic != FRAMES_TOPIC]
+        elif core:
             self._add(Shown(CORE_TOPIC, shown[-1].t_ns if shown else self._chunk_ns, 0, core))
         adds = {TICKS_TOPIC: self._tick, TELEMETRY_TOPIC: self._snapshot, FRAMES_TOPIC: self._add}
         for each in shown:
@@ -271,7 +274,8 @@ class RecordingWriter:
     def _end(self) -> None:
         with self._file:
             self._mcap.flush()  # type: ignore[no-untyped-call]
-            self._mcap.add_attachment(0, 0, OVERVIEW, "application/msgpack", self._overview.made().packed())
+            overview = msgspec.msgpack.encode(self._overview.made())
+            self._mcap.add_attachment(0, 0, OVERVIEW, "application/msgpack", overview)
             self._mcap.finish()  # type: ignore[no-untyped-call]
             self._file.flush()
             os.fsync(self._file.fileno())
