@@ -153,7 +153,6 @@ def test_a_request_waits_for_a_process_that_is_held_up(rig: Rig) -> None:
 
 
 def answered(rig: Rig) -> list[Write]:
-    """What the keeper is asked for, one after the other, as it says that each is written."""
     found: list[Write] = []
     while said := rig.heard():
         (asked,) = said
@@ -173,7 +172,6 @@ def test_requests_take_no_place_of_a_fault(rig: Rig, monkeypatch: pytest.MonkeyP
     with pytest.raises(RefusedError, match="20 black boxes"):  # of a keeper that never answers
         rig.box.write("SKEW", 0.0, {})
     assert "20 black boxes" in rig.box.report().refusal
-    # a fault's go first
     assert [each.reason for each in answered(rig)] == ["REQUEST", *["SKEW"] * 20, *["REQUEST"] * (MAX_REQUESTED - 1)]
     rig.box.write("REQUEST", 0.0, {})
 

@@ -60,7 +60,7 @@ def test_the_ring_keeps_half_a_minute_of_a_day() -> None:
     kept = ring.kept()
     (of_first, first), (of_last, last) = kept[0], kept[-1]
     assert last.time_s - first.time_s == pytest.approx(KEPT_S, abs=0.021)
-    assert of_first == of_last == OF_BOXES  # which each half begins with
+    assert of_first == of_last == OF_BOXES
 
 
 def test_the_ring_holds_no_more_bytes_than_it_may() -> None:

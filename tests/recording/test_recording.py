@@ -399,7 +399,7 @@ def test_all_is_kept_around_a_mark_also_one_made_just_before_the_file(tmp_path: 
         writer.ticks(msgspec.structs.replace(sent, core=msgspec.msgpack.encode([*sent.rows, frame, told])))
     recording = back(writer.path)
     assert (len(recording.ticks), len(recording.snapshots)) == (500, 1)
-    with writer.path.open("rb") as file:  # nothing for a replay
+    with writer.path.open("rb") as file:
         topics = {channel.topic for channel in make_reader(file).get_summary().channels.values()}
     assert topics == {"/ticks", "/telemetry"}
 

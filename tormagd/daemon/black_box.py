@@ -58,7 +58,7 @@ AFTER_FAULT_S = 2.0
 LEAVING_S, AGAIN_S = 2.0, 1.0
 "How long the end of a keeper is waited for, and how soon one that has ended is replaced."
 MAX_REQUESTED, MAX_OF_FAULTS = 8, 20
-"Boxes still to be written, at most: requested ones, and those of faults."
+"Boxes still to be written, at most."
 
 log = logging.getLogger(__name__)
 
@@ -90,9 +90,9 @@ class BlackBox:
         self._ring: Ring | None = None
         self._due_s, self.is_heard = 0.0, False
         self._unwritten: dict[str, tuple[float, Write]] = {}
-        "By name, with the time when it is due. A new keeper is asked for all of it."
+        "By name, and when it is due. A new keeper is asked for all of it."
         self._asked = ""
-        "What the keeper was last asked for, by name."
+        "The name in the newest request."
         if folder is None:
             self._refusal = "no folder is named for black boxes"
         elif importlib.util.find_spec("mcap") is None:
@@ -217,7 +217,7 @@ class BlackBox:
                 beside.process.wait(LEAVING_S)
 
     def _ask(self) -> None:
-        """Ask the keeper for the next box that is due, faults' first, after the one before."""
+        """Ask for the next box that is due, faults' first."""
         if self._beside is None or self._asked in self._unwritten:
             return
         due = [asked for due_s, asked in self._unwritten.values() if due_s <= time.monotonic()]

@@ -44,7 +44,7 @@ from tormagd.record.writer import (
     THINNED,
     TICKS_TOPIC,
     Derived,
-    Shown,
+    Shown as Shown,
     is_tick,
 )
 from tormagd_client.printable import printable
