@@ -180,14 +180,14 @@ def test_a_full_disk_ends_a_recording_that_can_still_be_read(
 
 
 def test_a_folder_that_is_moved_away_is_told_and_not_taken_for_a_full_disk(fake_daemon, tmp_path, ctl, monkeypatch):
-    folder, has_room = tmp_path / "a", RecordingFolder.room
+    folder, require_room = tmp_path / "a", RecordingFolder.require_room
     folder.mkdir()
 
-    def moved(self: RecordingFolder, needed_bytes: int) -> str:
+    def moved(self: RecordingFolder, needed_bytes: int) -> None:
         folder.rename(tmp_path / "b")
-        return has_room(self, needed_bytes)
+        require_room(self, needed_bytes)
 
-    monkeypatch.setattr(RecordingFolder, "room", moved)
+    monkeypatch.setattr(RecordingFolder, "require_room", moved)
     error = ctl(*fake_daemon.at, "--json", "record", str(folder)).ended(1).error
     assert (error["code"], "No such file or directory, after " in error["message"]) == ("not_written", True)
     assert error["hint"].startswith(f"see that {folder} stays in place and takes files; what is in the file")

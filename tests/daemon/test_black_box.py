@@ -21,7 +21,7 @@ from tormagd.daemon.profiles import state_folder
 from tormagd.ground.plain_values import plain
 from tormagd.hardware.connection import Connection
 from tormagd.hardware.streams import FrameStream
-from tormagd.record.keeper import Begin, End, Part, Ring, Write, Written, in_shared_memory
+from tormagd.record.keeper import End, Part, Ring, Write, Written, in_shared_memory
 from tormagd.record.stream import MAX_ENTRIES, PLAN, STEP, TEACH, Journal, Moment
 from tormagd.simulation.closed_loop import ClosedLoop
 from tormagd.simulation.device import VirtualDevice
@@ -88,14 +88,14 @@ def test_parts_have_the_ticks_in_their_order_and_a_state_every_second(rig: Rig) 
     rig.box.journal.note(PLAN, 1.0, TimedSetpoint(1.5, 1.0, 0.1))
     rig.tick(3_020)
     parts = rig.parts()
-    assert [begun for begun, _ in rig.ring.kept()] == [Begin("/boxes", {"format": "1"})] * len(parts)
+    assert [header for header, _ in rig.ring.kept()] == [{"format": "1", "folder": "/boxes"}] * len(parts)
     assert (names(parts[0])[:3], names(parts[0])[-3:]) == (["state", "step", "tick"], ["plan", "step", "tick"])
     assert [number for number, part in enumerate(parts) if "state" in names(part)] == [0, 100, 200, 300]
     assert [each for part in parts for each in names(part)].count("tick") == 3_015
     rig.box.begin_scene({"format": "2"}, rig.stepper, rig.planner)
     rig.tick(PART_TICKS)
-    begun, part = rig.ring.kept()[-1]
-    assert (begun, names(part)[:3]) == (Begin("/boxes", {"format": "2"}), ["missing", "state", "step"])
+    header, part = rig.ring.kept()[-1]
+    assert (header, names(part)[:3]) == ({"format": "2", "folder": "/boxes"}, ["missing", "state", "step"])
 
 
 def test_nothing_stays_of_what_was_handed_over(rig: Rig) -> None:
@@ -139,17 +139,27 @@ def test_what_finds_no_room_is_counted_and_control_goes_on(rig: Rig) -> None:
 def test_a_request_waits_for_a_process_that_is_held_up(rig: Rig) -> None:
     while rig.box._beside.send(b"x"):
         pass
-    path = rig.box.write("SKEW", 2.0, {"firmware": "1.0"})
+    path = rig.box.write("SKEW", 0.0, {"firmware": "1.0"})
     assert path.match("/boxes/*Z-SKEW.mcap")
     with contextlib.suppress(BlockingIOError):
         while rig.its.recv(1_000) == b"x":
             pass
     rig.box.look()
-    assert rig.heard() == [Write(str(path), "SKEW", 2.0, {"format": "1", "firmware": "1.0"})]
+    assert rig.heard() == [Write(str(path), "SKEW", {"format": "1", "folder": "/boxes", "firmware": "1.0"})]
     for written in (Written(path.name), Written("b.mcap", "No space left on device")):
         rig.its.send(msgspec.msgpack.encode(written))
         rig.box.look()
         assert (rig.box.report().newest, rig.box.report().refusal) == (path.name, written.refusal)
+
+
+def answered(rig: Rig) -> list[Write]:
+    found: list[Write] = []
+    while said := rig.heard():
+        (asked,) = said
+        found.append(asked)
+        rig.its.send(msgspec.msgpack.encode(Written(Path(asked.path).name)))
+        rig.box.look()
+    return found
 
 
 def test_requests_take_no_place_of_a_fault(rig: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -158,14 +168,24 @@ def test_requests_take_no_place_of_a_fault(rig: Rig, monkeypatch: pytest.MonkeyP
         with contextlib.nullcontext() if number < MAX_REQUESTED else pytest.raises(RefusedError, match="8 black boxes"):
             rig.box.write("REQUEST", 0.0, {})
         if number % 50 == 0:
-            rig.box.write("SKEW", 2.0, {})
-    assert [said.reason for said in rig.heard() if isinstance(said, Write)].count("SKEW") == 20
-    with pytest.raises(RefusedError, match="28 black boxes"):  # of a keeper that never answers
-        rig.box.write("SKEW", 2.0, {})
-    assert "28 black boxes" in rig.box.report().refusal
-    rig.its.send(msgspec.msgpack.encode(Written("19700101T000000.000Z-REQUEST.mcap")))
-    rig.box.look()
+            rig.box.write("SKEW", 0.0, {})
+    with pytest.raises(RefusedError, match="20 black boxes"):  # of a keeper that never answers
+        rig.box.write("SKEW", 0.0, {})
+    assert "20 black boxes" in rig.box.report().refusal
+    assert [each.reason for each in answered(rig)] == ["REQUEST", *["SKEW"] * 20, *["REQUEST"] * (MAX_REQUESTED - 1)]
     rig.box.write("REQUEST", 0.0, {})
+
+
+def test_a_fault_s_box_has_what_came_after_it_also_where_the_daemon_ends(rig: Rig) -> None:
+    asked_s = time.monotonic()
+    rig.box.write("SKEW", 0.2, {})
+    while not (said := rig.heard()):
+        rig.box.look()
+    assert (said[0].reason, time.monotonic() - asked_s >= 0.2) == ("SKEW", True)
+    rig.box.write("STALL", 3_600.0, {})
+    rig.box.close()
+    *asked, end = rig.heard()
+    assert ([each.reason for each in asked], end) == (["SKEW", "STALL"], End())
 
 
 @pytest.mark.parametrize("is_noticed", [True, False])
@@ -198,7 +218,7 @@ def test_a_keeper_that_ended_is_replaced_and_no_tick_is_lost(rig: Rig, monkeypat
     monkeypatch.setattr(rig.box, "_due_s", ended_s)
     assert rig.box.is_missing
     rig.box.look()
-    assert ([said.path for said in rig.heard()], rig.box.is_missing) == ([*map(str, paths)], False)
+    assert ([each.path for each in answered(rig)], rig.box.is_missing) == ([*map(str, paths)], False)
 
 
 def test_an_entry_that_cannot_be_written_ends_the_box_and_not_control(rig: Rig) -> None:

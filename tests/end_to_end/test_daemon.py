@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 
 from tormagd.ctl.processes import end
-from tormagd.record.reader import Seen, read_recording
+from tormagd.record.reader import Shown, read_recording
 
 pytestmark = pytest.mark.live
 
@@ -46,7 +46,7 @@ def killed_it_leaves_a_whole_recording(rig) -> None:
     finally:
         recorder.kill()
         recorder.wait()
-    seen: list[Seen] = []
+    seen: list[Shown] = []
     recording = read_recording(path, dict[str, Any], seen.append)
     assert recording.is_complete
     assert max(each.t_ns for each in seen if each.is_tick) >= newest["t_ns"]

@@ -5,7 +5,7 @@ from typing import Any, NamedTuple
 
 import msgspec
 
-from tormagd.record.reader import Seen, read_recording
+from tormagd.record.reader import Shown, read_recording
 from tormagd.record.stream import TOLD
 from tormagd.record.ticks import TickBatch
 from tormagd.record.writer import RecordingWriter
@@ -31,8 +31,8 @@ def tell(writer: RecordingWriter, *snapshots: Telemetry) -> None:
 
 
 class Back(NamedTuple):
-    ticks: list[Seen]
-    snapshots: list[Seen]
+    ticks: list[Shown]
+    snapshots: list[Shown]
     metadata: dict[str, str]
     is_complete: bool
 
@@ -41,7 +41,7 @@ class Back(NamedTuple):
 
 
 def back(path: Path) -> Back:
-    seen: list[Seen] = []
+    seen: list[Shown] = []
     found = read_recording(path, dict[str, Any], seen.append)
     ticks, snapshots = ([each for each in seen if each.is_tick is kind] for kind in (True, False))
     return Back(ticks, snapshots, found.metadata, found.is_complete)

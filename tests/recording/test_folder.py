@@ -9,6 +9,7 @@ import sys
 import time
 from pathlib import Path
 from types import SimpleNamespace
+from unittest.mock import Mock
 
 import pytest
 from mcap.writer import MCAP0_MAGIC
@@ -112,10 +113,12 @@ def test_a_folder_full_of_marked_recordings_is_full_and_says_so(tmp_path: Path, 
     assert len(folder.segments()) == 6
     # what stays free is for black boxes
     monkeypatch.setattr(shutil, "disk_usage", lambda path: SimpleNamespace(free=900_000))
-    assert "0.9 MB are free, and 1.0 stay so for black boxes" in folder.room(0)
+    with pytest.raises(OSError, match=r"0\.9 MB are free, and 1\.0 stay so for black boxes"):
+        folder.require_room(0)
     # what others fill is not made good by recordings
     unmarked = of_days(tmp_path, START_NS * 1e-9, -1, 0)
-    assert "nothing unmarked is left that would help" in folder.room(0)
+    with pytest.raises(OSError, match="nothing unmarked is left that would help"):
+        folder.require_room(0)
     assert all(path.exists() for path in unmarked)
 
 
@@ -155,6 +158,15 @@ def test_a_recorder_whose_budget_is_full_ends_its_segment_in_order(tmp_path: Pat
     known = RecordingFile(writer.path)
     assert (known.is_complete, [each.text for each in known.overview.marks]) == (False, ["here"])
     assert known.damage == ""
+
+
+def test_a_segment_is_ended_in_order_whatever_keeps_the_next_from_beginning(tmp_path: Path, monkeypatch) -> None:
+    recorder = RecordingWriter(RecordingFolder(tmp_path, SETTINGS, Clock()))
+    monkeypatch.setattr(RecordingFolder, "new", Mock(side_effect=PermissionError(13, "Permission denied")))
+    with pytest.raises(OSError, match="Permission denied"), recorder:
+        recorder.ticks(batch((0, 1.0, 1.0, 35.0, 36.0, 0.25), (3.7e6, 1.0, 1.0, 35.0, 36.0, 0.25)))
+    known = RecordingFile(recorder.path)
+    assert (known.overview.ticks, known.notes) == (2, ["cut short: Permission denied"])
 
 
 def record(path: Path, clock: Clock, hours: int, rng: random.Random) -> list[str]:
@@ -211,7 +223,7 @@ def deadly(function, is_before):
     return call
 from tormagd.record import writer
 room, name = {
-    "rotate": (writer.RecordingWriter, "_rotate"), "begin": (writer.RecordingWriter, "_begin"),
+    "rotate": (writer.RecordingFolder, "new"), "begin": (writer.RecordingWriter, "_begin"),
     "prune": (Path, "unlink"), "mark": (Path, "rename"), "flush": (writer.Writer, "flush"),
     "finish": (writer.Writer, "finish"),
 }[what]

@@ -20,7 +20,6 @@ from tormagd.record.keeper import (
     KEPT_S,
     MAX_BYTES,
     MAX_FILES,
-    Begin,
     End,
     Part,
     Ring,
@@ -33,6 +32,13 @@ from tormagd.record.writer import is_tick
 
 PATIENCE_S = 60.0
 HEADER = {"format": "0", "scene": "a", "columns": json.dumps(["t_ns", "x"])}
+
+
+def headed(folder: Path | str, scene: str = "a") -> dict[str, str]:
+    return HEADER | {"folder": str(folder), "scene": scene}
+
+
+OF_BOXES = headed("/boxes")
 
 
 def part(time_s: float, size: int = 100) -> Part:
@@ -50,18 +56,20 @@ def kept(ring: Ring) -> int:
 def test_the_ring_keeps_half_a_minute_of_a_day() -> None:
     ring = Ring()
     for number in range(10_000):
-        ring.put(part(0.02 * number))
-    parts = parts_in(ring)
-    assert parts[-1].time_s - parts[0].time_s == pytest.approx(KEPT_S, abs=0.021)
+        ring.put(OF_BOXES, part(0.02 * number))
+    kept = ring.kept()
+    (of_first, first), (of_last, last) = kept[0], kept[-1]
+    assert last.time_s - first.time_s == pytest.approx(KEPT_S, abs=0.021)
+    assert of_first == of_last == OF_BOXES
 
 
 def test_the_ring_holds_no_more_bytes_than_it_may() -> None:
     ring = Ring()
     for number in range(300):
-        ring.put(part(0.001 * number, 1_000_000))
+        ring.put(OF_BOXES, part(0.001 * number, 1_000_000))
         if number % 40 == 39:
             assert MAX_BYTES // 2 - 1_000_000 <= kept(ring) <= MAX_BYTES or number < 60
-    ring.put(part(1.0, MAX_BYTES + 1))
+    ring.put(OF_BOXES, part(1.0, MAX_BYTES + 1))
     assert parts_in(ring)[-1].time_s == 1.0  # the newest is always there
     assert os.fstat(ring.file).st_blocks * 512 < 2 * MAX_BYTES + 2_000_000
 
@@ -72,7 +80,7 @@ def test_neither_bound_is_passed(steps: list[tuple[float, int]]) -> None:
     ring, now_s = Ring(None, 5.0, 200), 0.0
     for step_s, size in steps:
         now_s += step_s
-        ring.put(part(now_s, size))
+        ring.put(OF_BOXES, part(now_s, size))
         parts = parts_in(ring)
         assert kept(ring) <= 200
         assert parts[-1].time_s - parts[0].time_s <= 5.0
@@ -80,12 +88,11 @@ def test_neither_bound_is_passed(steps: list[tuple[float, int]]) -> None:
 
 
 def test_a_ring_that_broke_off_within_a_part_has_those_before() -> None:
-    ring, scenes = Ring(), [Begin("/boxes", {"scene": name}) for name in "ab"]
-    for number, begun in enumerate(scenes):
-        ring.begin(begun)
-        ring.put(part(float(number)))
+    ring, scenes = Ring(), [{"folder": "/boxes", "scene": name} for name in "ab"]
+    for number, header in enumerate(scenes):
+        ring.put(header, part(float(number)))
         os.pwrite(ring.file, b"\xc1" * 50, ring._at + 4)
-    assert [(begun, each.time_s) for begun, each in Ring(ring.file).kept()] == [(scenes[0], 0.0), (scenes[1], 1.0)]
+    assert [(header, each.time_s) for header, each in Ring(ring.file).kept()] == [(scenes[0], 0.0), (scenes[1], 1.0)]
 
 
 def test_a_list_that_begins_with_a_number_is_a_tick() -> None:
@@ -112,12 +119,12 @@ class Process:
                 text=True,
             )
 
-    def say(self, *words: Begin | Part | Write | End) -> None:
+    def say(self, *words: dict[str, str] | Part | Write | End) -> None:
         for word in words:
-            if isinstance(word, Begin):
-                self.ring.begin(word)
+            if isinstance(word, dict):
+                self.header = word
             elif isinstance(word, Part):
-                self.ring.put(word)
+                self.ring.put(self.header, word)
             else:
                 self.ours.send(msgspec.msgpack.encode(word))
 
@@ -141,9 +148,9 @@ def process(tmp_path: Path) -> Iterator[Process]:
     made.ring_path.unlink(missing_ok=True)
 
 
-def written(folder: Path, name: str, after_s: float = 0.0, **header: str) -> Write:
+def written(folder: Path, name: str, **header: str) -> Write:
     reason = name.removesuffix(".mcap").rpartition("-")[2]
-    return Write(str(folder / name), reason, after_s, HEADER | header)
+    return Write(str(folder / name), reason, headed(folder) | header)
 
 
 def ticks(first: int, count: int) -> Part:
@@ -159,7 +166,7 @@ def test_it_writes_what_it_is_told_and_what_a_dead_daemon_left(process: Process,
         (folder / f"20200101T0000{number:02d}.000Z-REQUEST.mcap").touch()
     (folder / "20200101T000000.000Z-SKEW-to-keep.mcap").touch()
     (folder / "20200101T000000.000Z-SKEW.mcap").mkdir()
-    process.say(Begin(str(folder), HEADER), ticks(1, 20), ticks(21, 20))
+    process.say(headed(folder), ticks(1, 20), ticks(21, 20))
     process.say(written(folder, "20300101T000000.000Z-SKEW.mcap", firmware="1.2"))
     assert process.heard() == Written("20300101T000000.000Z-SKEW.mcap")
     box = BlackBoxFile(folder / "20300101T000000.000Z-SKEW.mcap")
@@ -176,15 +183,14 @@ def test_it_writes_what_it_is_told_and_what_a_dead_daemon_left(process: Process,
     # a folder that is none says so
     process.say(written(folder / "20300101T000000.000Z-SKEW.mcap", "x-SKEW.mcap"))
     assert "x-SKEW.mcap" in process.heard().refusal
-    # what is due later is of the scene of which it was asked for
-    process.say(written(folder, "20300102T000000.000Z-DUE.mcap", after_s=3_600.0))
-    process.say(Begin(str(folder), HEADER | {"scene": "b"}), Part(0.05, b"\xc1"))
+    # what is asked for late is of the scene that its header names
+    process.say(headed(folder, "b"), Part(0.05, b"\xc1"), written(folder, "20300102T000000.000Z-DUE.mcap"))
+    assert process.heard().refusal == ""
     # so does a part that is none
     process.say(written(folder, "y-SKEW.mcap", scene="b"))
     assert process.heard().refusal.startswith(f"{folder}/y-SKEW.mcap: DecodeError")
     # no word, no daemon: it was killed. Each beginning is of another scene, and keeps nothing of the one before
-    process.say(Begin(str(folder), HEADER | {"scene": "c"}), ticks(61, 20))
-    process.say(written(folder, "2031Z-LATER.mcap", 3_600.0, scene="c"))
+    process.say(headed(folder, "c"), ticks(61, 20), written(folder, "2031Z-LATER.mcap", scene="c"))
     process.die()
     assert process.child.wait(PATIENCE_S) == 0
     (left,) = folder.glob(f"*{DIED}.mcap")
@@ -195,16 +201,15 @@ def test_it_writes_what_it_is_told_and_what_a_dead_daemon_left(process: Process,
 
 @pytest.mark.parametrize("is_daemon_killed", [True, False], ids=["both were killed", "the keeper was killed"])
 def test_what_a_killed_keeper_had_is_there_after_it(process: Process, tmp_path: Path, is_daemon_killed: bool) -> None:
-    process.say(Begin(str(tmp_path), HEADER), ticks(1, 20))
+    process.say(headed(tmp_path), ticks(1, 20))
     process.child.kill()
     process.child.wait()
     if is_daemon_killed:
         process.die()
         after = Process(tmp_path)
-        after.say(Begin(str(tmp_path), HEADER))
     else:
         after = Process(tmp_path, process.ring)
-    after.say(ticks(21, 20), written(tmp_path, "2Z-Y.mcap"))
+    after.say(headed(tmp_path), ticks(21, 20), written(tmp_path, "2Z-Y.mcap"))
     while after.heard().name != "2Z-Y.mcap":
         pass
     after.say(End())
@@ -235,7 +240,7 @@ def test_another_s_files_are_not_taken(tmp_path: Path, monkeypatch: pytest.Monke
 
 @pytest.mark.parametrize("words", [(), (ticks(1, 20), End())], ids=["gone before it kept anything", "ended in order"])
 def test_it_ends_with_the_daemon_and_leaves_nothing(process: Process, tmp_path: Path, words: tuple[Any, ...]) -> None:
-    process.say(Begin(str(tmp_path / "boxes"), HEADER), *words)
+    process.say(headed(tmp_path / "boxes"), *words)
     process.die()
     assert process.child.communicate(timeout=PATIENCE_S) == (None, "")
     assert not (tmp_path / "boxes").exists()

@@ -22,6 +22,7 @@ from sent import COLUMNS, START_NS, back, batch, telemetry, tell
 
 from tormagd.record.overview import MAX_STRETCHES, Codes, Glance, OverviewBuilder, unpacked
 from tormagd.record.reader import RecordingError, RecordingFile, damage_in, overview_of
+from tormagd.record.stream import TOLD
 from tormagd.record.ticks import decode_ticks
 from tormagd.record.writer import THINNED, RecordingWriter
 from tormagd.view.plot import figure, save_plot
@@ -319,7 +320,7 @@ def test_a_step_of_the_clock_is_shown_and_stretches_nothing(tmp_path: Path, step
 def test_what_the_recorder_wrote_is_what_its_messages_give(path: Path, tmp_path: Path) -> None:
     known, again = RecordingFile(path), altered(tmp_path, path.read_bytes()[:-1])
     assert (known.is_complete, again.is_complete) == (True, False)
-    assert known.overview == again.overview == unpacked(known.overview.packed())
+    assert known.overview == again.overview == unpacked(msgspec.msgpack.encode(known.overview))
     overview = known.overview
     assert (overview.ticks, overview.snapshots, [mark.text for mark in overview.marks]) == (30_000, 1_500, ["here"])
     force = overview.series("measured_cf")
@@ -388,6 +389,21 @@ def test_a_thinned_recording_has_all_around_a_fault_and_a_mark_and_says_so(tmp_p
     assert RecordingFile(path).overview.ticks == 30_000
 
 
+@pytest.mark.parametrize("made_ms", [-10, 10])
+def test_all_is_kept_around_a_mark_also_one_made_just_before_the_file(tmp_path: Path, made_ms: int) -> None:
+    mark = Mark(t_ns=START_NS + made_ms * 1_000_000, text="here")
+    sent = batch(*(row(k) for k in range(500)), columns=ALL_COLUMNS)
+    told = [TOLD, msgspec.to_builtins(telemetry(0, 0, mark=mark))]
+    frame = ["read", 1.0, b"frame"]
+    with RecordingWriter(tmp_path / "a.mcap", every=50) as writer:
+        writer.ticks(msgspec.structs.replace(sent, core=msgspec.msgpack.encode([*sent.rows, frame, told])))
+    recording = back(writer.path)
+    assert (len(recording.ticks), len(recording.snapshots)) == (500, 1)
+    with writer.path.open("rb") as file:
+        topics = {channel.topic for channel in make_reader(file).get_summary().channels.values()}
+    assert topics == {"/ticks", "/telemetry"}
+
+
 @pytest.mark.parametrize(
     "change",
     [
@@ -401,9 +417,9 @@ def test_a_thinned_recording_has_all_around_a_fault_and_a_mark_and_says_so(tmp_p
     ],
 )
 def test_an_overview_that_no_tormagd_writes_is_refused(path: Path, change: dict[str, Any]) -> None:
-    odd = msgspec.structs.replace(RecordingFile(path).overview, **change)
+    odd = msgspec.structs.asdict(RecordingFile(path).overview) | change
     with pytest.raises(ValueError, match="its overview: "):
-        unpacked(odd.packed())
+        unpacked(msgspec.msgpack.encode(odd))
 
 
 def test_any_length_is_held_in_bounds() -> None:
@@ -416,7 +432,7 @@ def test_any_length_is_held_in_bounds() -> None:
         )
     made = builder.made()
     assert made.late_counts == [1_100, *[2_200] * 8, 1_100]
-    assert len(made.packed()) < 200_000
+    assert len(msgspec.msgpack.encode(made)) < 200_000
     force = made.series("measured_cf")
     assert (force.low.min(), force.high.max()) == (0.0, 19_799.0)
     assert len(made.codes["limits"]["RATE"].spans_ns) <= 1_000

@@ -21,7 +21,6 @@ from tormagd.control.safety.operating_state import SafetyState
 from tormagd.element.model.displacement import Turn
 from tormagd.ground.plain_values import InexactError, first_difference, kinds, packed, plain, restore, restored
 from tormagd.hardware.link_statistics import RoundTrip
-from tormagd.record.rerun import KNOWN_OF_LINK
 from tormagd.record.stream import KNOWN
 
 ROOT = Path(__file__).parents[2]
@@ -156,4 +155,4 @@ ROUND_TRIP = plain(RoundTrip())["RoundTrip"]
 )
 def test_what_nobody_remembers_is_refused(data: Any) -> None:
     with pytest.raises(InexactError):
-        restore(RoundTrip(), data, KNOWN_OF_LINK)
+        restore(RoundTrip(), data, KNOWN)

@@ -21,7 +21,7 @@ from tormagd.config import Config
 from tormagd.control.assembly.build import SOURCES, Core, sources_hash
 from tormagd.control.records import TimedSetpoint
 from tormagd.control.safety.codes import Fault
-from tormagd.record.reader import BlackBoxFile, RecordingError, Seen, read_recording
+from tormagd.record.reader import BlackBoxFile, RecordingError, Shown, read_recording
 from tormagd.record.rerun import ReplayError, differences, rebuilt, recorded, rerun, ticks_of
 from tormagd.record.stream import ANSWER, COLUMNS, CONFIRM, FORMAT, MISSING
 from tormagd.record.writer import Derived, write_black_box
@@ -124,7 +124,7 @@ def test_the_other_build_replays_them_to_the_bit(fly: Any, path: Path, tmp_path:
 
 
 def test_a_black_box_is_drawn_like_a_recording(path: Path) -> None:
-    seen: list[Seen] = []
+    seen: list[Shown] = []
     assert read_recording(path, dict[str, Any], seen.append).is_complete
     assert (len(seen), seen[-1].message["faults"]) == (TICKS, ["ENCODER"])
     assert {name for each in seen for name in each.message} <= set(COLUMNS)
@@ -196,19 +196,28 @@ def test_a_command_that_is_missing_is_found(core: Core, box: BlackBoxFile) -> No
 
 
 @pytest.mark.parametrize(
-    ("edit", "said"),
+    ("was_refused", "recorded", "replayed"), [(True, "refused", "taken"), (False, "taken", "refused: ")]
+)
+def test_a_command_that_is_now_taken_or_refused_is_found(
+    core: Core, box: BlackBoxFile, was_refused: bool, recorded: str, replayed: str
+) -> None:
+    place = next(n for n, it in enumerate(box.entries) if it[0] == "command" and it[3] is not was_refused)
+    found = rerun(core, altered(box.entries, place, 3, was_refused)).difference
+    assert (found.field, found.recorded) == (box.entries[place][1], recorded)
+    assert found.replayed.startswith(replayed)
+
+
+@pytest.mark.parametrize(
+    "edit",
     [
-        (
-            lambda shown: shown._replace(message=shown.message | {"operating_state": "ENABLED"}),
-            "message 300 in /ticks is not",
-        ),
-        (lambda shown: shown._replace(t_ns=shown.t_ns + 1), "message 300 in /ticks is not"),
-        (lambda shown: None, "message 301 in /ticks is not"),
-        (lambda shown: shown._replace(sequence=7), "message 7 in /ticks is not"),
-        (lambda shown: shown._replace(topic="/telemetry", sequence=1), "message 1 in /telemetry is not"),
+        lambda shown: shown._replace(message=shown.message | {"operating_state": "ENABLED"}),
+        lambda shown: shown._replace(t_ns=shown.t_ns + 1),
+        lambda shown: None,
+        lambda shown: shown._replace(sequence=7),
+        lambda shown: shown._replace(topic="/telemetry", sequence=1),
     ],
 )
-def test_what_people_see_is_what_replays_or_is_named(path: Path, tmp_path: Path, monkeypatch: Any, edit, said) -> None:
+def test_what_people_see_is_what_replays_or_is_named(path: Path, tmp_path: Path, monkeypatch: Any, edit) -> None:
     box = BlackBoxFile(path)
     assert box.odd == ""
     head = [*box.entries[: list(ticks_of(box.entries))[600]], ["told", {"t_ns": 1, "seq": 0}]]
@@ -225,7 +234,15 @@ def test_what_people_see_is_what_replays_or_is_named(path: Path, tmp_path: Path,
     monkeypatch.setattr(Derived, "of", other)
     write_black_box(tmp_path / "edited.mcap", box.metadata, [msgspec.msgpack.encode(head)])
     monkeypatch.undo()
-    assert BlackBoxFile(tmp_path / "edited.mcap").odd.startswith(said)
+    assert BlackBoxFile(tmp_path / "edited.mcap").odd == "message 300 in /ticks is not what /core has"
+
+
+def test_a_message_that_is_missing_at_the_end_is_named(box: BlackBoxFile, tmp_path: Path, monkeypatch: Any) -> None:
+    head, derived = box.entries[: list(ticks_of(box.entries))[60] + 1], Derived.of
+    monkeypatch.setattr(Derived, "of", lambda *told: list(derived(*told))[:-1])
+    write_black_box(tmp_path / "short.mcap", box.metadata, [msgspec.msgpack.encode(head)])
+    monkeypatch.undo()
+    assert BlackBoxFile(tmp_path / "short.mcap").odd == "message 60 in /ticks is not what /core has"
 
 
 def test_the_sources_hash_is_of_every_room(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -26,7 +26,7 @@ from tormag_lab.arrays import Array
 from tormag_lab.human_pulse import pulse_profile
 from tormagd.control.safety.codes import Fault
 from tormagd.ctl.processes import begun, end, first_line, is_linked, processor_s
-from tormagd.record.reader import RecordingError, Seen, read_recording
+from tormagd.record.reader import RecordingError, Shown as Seen, read_recording
 from tormagd_client import Client, ClientError, UnreachableError
 from tormagd_client.messages import MessageError, Telemetry
 

@@ -77,14 +77,9 @@ def record(config: Config, endpoints: Endpoints, path: Path, duration_s: float, 
         if not _is_ready(ticks, wait_s, is_interrupted):
             raise unreachable(endpoints.recording, f"nothing is published there within {wait_s:g} s")
         about = _about(endpoints, wait_s)
-        try:
+        with as_usage_error(OSError, hint=WRITABLE):
             place = RecordingFolder(path, config.recordings) if is_folder else path
             writer = RecordingWriter(place, about, config.recordings.one_tick_of)
-        except FileExistsError as error:
-            raise usage_error(f"{path} exists", "give another name; recordings are never overwritten") from error
-        except OSError as error:
-            error.filename = str(path)
-            raise refused(error, WRITABLE) from error
         try:
             with writer:
                 outcome = _record(writer, ticks, duration_s, is_interrupted)
@@ -129,10 +124,8 @@ def _record(
     start_s = heard_s = time.monotonic()
     is_over = False
     while not is_over:
-        left_s = start_s + duration_s - time.monotonic()
-        is_over = is_interrupted() or left_s <= 0.0
-        if not is_over:
-            ticks.poll(round(min(left_s * 1e3, POLL_MS)))
+        ticks.poll(POLL_MS)
+        is_over = is_interrupted() or time.monotonic() >= start_s + duration_s
         # what waits at the end came before it
         until_s = time.monotonic() + (LONGEST_END_S if is_over else POLL_MS / 1e3)
         while ticks.poll(0) and time.monotonic() < until_s:
@@ -155,8 +148,9 @@ def _record(
         "silent_ms": round(silent_s * 1e3, 3),
         "unreadable": unreadable,
     }
-    text = f"{writer.path}: {writer.tick_count} ticks, {writer.telemetry_count} snapshots"
-    text += f"; {writer.ticks_lost} ticks lost"
+    text = (
+        f"{writer.path}: {writer.tick_count} ticks, {writer.telemetry_count} snapshots; {writer.ticks_lost} ticks lost"
+    )
     if writer.restarts:
         text += f"; the daemon began anew {writer.restarts} times, and nothing is known of between"
     if silent_s > SILENT_S:
@@ -228,7 +222,7 @@ def _row(segment: Segment) -> dict[str, Any]:
 def _prune(folder: RecordingFolder) -> Outcome:
     """Delete what is over the budget, and say what was deleted and whether that is enough."""
     gone = folder.prune()
-    over = folder.make_room(0)
+    over = folder.over(folder.segments())
     names = [each.path.name for each in gone]
     text = f"{len(gone)} recording{'s' * (len(gone) != 1)} taken away, {sum(each.bytes for each in gone) / 1e6:.1f} MB"
     return Outcome({"removed": names, "over": over}, f"{text}\n{over}".strip(), Exit.REFUSED if over else Exit.DONE)

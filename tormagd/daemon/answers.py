@@ -128,7 +128,7 @@ class Answers:
                 rate_N_s=tuple(round(scaled_mm_s * slope, 4) for slope in portrait.slope_N_mm[::PORTRAIT_STEP]),
             ),
             configuration_file=self._config_file,
-            core={name: self._commands.box.begun.header[name] for name in OF_CORE},
+            core={name: self._commands.box.header[name] for name in OF_CORE},
         )
 
     def status(self) -> Status:

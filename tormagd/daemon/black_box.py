@@ -10,7 +10,6 @@ import importlib.util
 import logging
 import subprocess
 import time
-from collections import deque
 from pathlib import Path
 from typing import Any
 
@@ -28,7 +27,6 @@ from tormagd.hardware.connection import Connection
 from tormagd.record.keeper import (
     REQUEST,
     SHARED_MEMORY,
-    Begin,
     End,
     Part,
     Ring,
@@ -59,8 +57,8 @@ AFTER_FAULT_S = 2.0
 "How long a black box goes on after its fault: the gap opens."
 LEAVING_S, AGAIN_S = 2.0, 1.0
 "How long the end of a keeper is waited for, and how soon one that has ended is replaced."
-MAX_REQUESTED, MAX_UNWRITTEN = 8, 28
-"Boxes that somebody asked for and that are still to be written, at most; and all that are."
+MAX_REQUESTED, MAX_OF_FAULTS = 8, 20
+"Boxes still to be written, at most."
 
 log = logging.getLogger(__name__)
 
@@ -86,14 +84,15 @@ class BlackBox:
     """Keeps the core's journal in a ring, from which the keeper, another process, writes black boxes into `folder`."""
 
     def __init__(self, folder: Path | None, header: dict[str, str], control_hz: int) -> None:
-        self._folder, self.begun = folder, Begin(str(folder), header)
+        self._folder, self.header = folder, header | {"folder": str(folder)}
         self._refusal, self._newest, self._dropped = "", "", 0
         self._beside: ChildProcess | None = None
         self._ring: Ring | None = None
         self._due_s, self.is_heard = 0.0, False
-        self._unwritten: dict[str, Write] = {}
-        "By name: what the keeper has not answered. A new keeper is asked for all of it."
-        self._unsent: deque[Write] = deque()
+        self._unwritten: dict[str, tuple[float, Write]] = {}
+        "By name, and when it is due. A new keeper is asked for all of it."
+        self._asked = ""
+        "The name in the newest request."
         if folder is None:
             self._refusal = "no folder is named for black boxes"
         elif importlib.util.find_spec("mcap") is None:
@@ -101,7 +100,6 @@ class BlackBox:
             log.warning("no black box is kept: %s; next: mend that and start the daemon again", self._refusal)
         else:
             self._ring = Ring(in_shared_memory(str(folder)))
-            self._ring.begin(self.begun)
             self.look()
         self.journal = Journal(is_kept=self._ring is not None)
         self._ticks = PART_TICKS // 2
@@ -115,9 +113,7 @@ class BlackBox:
 
     def begin_scene(self, header: dict[str, str], stepper: Stepper, planner: Planner) -> None:
         """Begin anew with the core of another scene, from a snapshot of these states."""
-        self.begun = Begin(str(self._folder), header)
-        if self._ring is not None:
-            self._ring.begin(self.begun)
+        self.header = header | {"folder": str(self._folder)}
         self._begin_anew(stepper, planner)
 
     def ticked(self, moment: Moment, stepper: Stepper, planner: Planner) -> tuple[bytes, list[Any]] | None:
@@ -135,7 +131,7 @@ class BlackBox:
                 entries = self.journal.take()
                 part = packed(entries), [each for each in entries if isinstance(each, msgspec.Raw)]
                 if self._ring is not None:
-                    self._ring.put(Part(moment.time_s, part[0]))
+                    self._ring.put(self.header, Part(moment.time_s, part[0]))
         except (TypeError, ValueError, OverflowError, OSError) as error:  # control goes on, whatever is in it
             if not self._dropped:
                 log.error(
@@ -150,26 +146,22 @@ class BlackBox:
         return part
 
     def write(self, reason: str, after_s: float, details: dict[str, str]) -> Path:
-        """Ask the keeper to write a black box, and return the path that it will have."""
+        """Have a black box written in `after_s`, and return its path."""
         if self._ring is None:
             raise RefusedError(
                 "no_black_box",
                 f"there is no black box: {self._refusal}",
                 "name [black_box] folder in the daemon's configuration, and start it again",
             )
-        waiting = [each.reason for each in self._unwritten.values()]
-        if reason == REQUEST and waiting.count(REQUEST) >= MAX_REQUESTED:
-            raise RefusedError(
-                "busy", f"{MAX_REQUESTED} black boxes are still to be written", "ask again in a few seconds"
-            )
-        if len(waiting) >= MAX_UNWRITTEN:
-            self._refusal = f"{MAX_UNWRITTEN} black boxes are still to be written"
+        is_requested = reason == REQUEST
+        alike = sum((asked.reason == REQUEST) is is_requested for _, asked in self._unwritten.values())
+        if alike >= (MAX_REQUESTED if is_requested else MAX_OF_FAULTS):
+            self._refusal = f"{alike} black boxes are still to be written"
             raise RefusedError("busy", self._refusal, "ask again in a few seconds")
         path = box_path(str(self._folder), reason)
         self._refusal = ""
-        self._unwritten[path.name] = asked = Write(str(path), reason, after_s, self.begun.header | details)
-        self._unsent.append(asked)
-        self._send_requests()
+        self._unwritten[path.name] = time.monotonic() + after_s, Write(str(path), reason, self.header | details)
+        self._ask()
         return path
 
     @property
@@ -178,15 +170,14 @@ class BlackBox:
         return self._ring is not None and self._beside is None
 
     def look(self) -> None:
-        """Start a keeper where one is due, send it the requests that wait, and note its answers."""
+        """Start a keeper where one is due, note its answers, and ask it for what is due."""
         if self._ring is not None and self._beside is None and time.monotonic() >= self._due_s:
             try:
                 self._beside = ChildProcess(KEEPER, self._ring.file)
             except OSError as error:
                 self._wait(f"the process that writes it did not start: {error.strerror}")
             else:
-                self._refusal, self._unsent = "", deque(self._unwritten.values())
-        self._send_requests()
+                self._refusal = self._asked = ""
         while self._beside is not None and (data := self._beside.receive()) is not None:
             answer = msgspec.msgpack.decode(data, type=Written)
             self._refusal = answer.refusal
@@ -196,6 +187,7 @@ class BlackBox:
             else:
                 self._newest = answer.name
                 log.info("black box: %s/%s", self._folder, answer.name)
+        self._ask()
         if self._beside is not None and self._beside.is_gone:
             self._beside.close()
             self._beside = None
@@ -217,14 +209,21 @@ class BlackBox:
         if self._ring is not None:
             self._ring.path.unlink(missing_ok=True)
         if (beside := self._beside) is not None:
+            for _, asked in self._unwritten.values():
+                beside.send(msgspec.msgpack.encode(asked))
             beside.send(msgspec.msgpack.encode(End()))
             beside.close()
             with contextlib.suppress(subprocess.TimeoutExpired):
                 beside.process.wait(LEAVING_S)
 
-    def _send_requests(self) -> None:
-        while self._beside is not None and self._unsent and self._beside.send(msgspec.msgpack.encode(self._unsent[0])):
-            self._unsent.popleft()
+    def _ask(self) -> None:
+        """Ask for the next box that is due, faults' first."""
+        if self._beside is None or self._asked in self._unwritten:
+            return
+        due = [asked for due_s, asked in self._unwritten.values() if due_s <= time.monotonic()]
+        due.sort(key=lambda asked: asked.reason == REQUEST)
+        if due and self._beside.send(msgspec.msgpack.encode(due[0])):
+            self._asked = Path(due[0].path).name
 
     def _begin_anew(self, stepper: Stepper, planner: Planner) -> None:
         """Forget what was not handed over."""
@@ -235,7 +234,7 @@ class BlackBox:
     def _snapshot(self, stepper: Stepper, planner: Planner) -> None:
         if self.journal.is_kept:
             memory = None if self._connection is None else self._connection.memory()
-            core = self.begun.header.get("core_sha256", "")
+            core = self.header.get("core_sha256", "")
             self.journal.note(STATE, plain(stepper), plain(planner), memory, core)
 
     def _wait(self, reason: str) -> None:

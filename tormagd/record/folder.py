@@ -32,6 +32,10 @@ _NAME = re.compile(rf"(\d{{4}}-\d\d-\d\dT\d\d-\d\d-\d\d)(\.\d{{3}}Z)?({re.escape
 _FORM = "%Y-%m-%dT%H-%M-%S"
 
 
+class NoRoomError(OSError):
+    """What is to be written does not fit; what was written can be read."""
+
+
 class Segment(NamedTuple):
     """One recording in a folder: when it began, as its name says, and was last written, both s since 1970."""
 
@@ -88,9 +92,7 @@ class RecordingFolder:
 
     def new(self) -> Path:
         """Prune until a whole segment has room, and return the path for a new one, named by the present time."""
-        reason = self.make_room(self.budget.segment_MB * MB + END_BYTES)
-        if reason:
-            raise OSError(errno.ENOSPC, reason)
+        self._make_room(self.budget.segment_MB * MB + END_BYTES)
         now = datetime.fromtimestamp(self._clock(), UTC)
         return self.path / f"{now:{_FORM}}.{now.microsecond // 1_000:03d}Z.mcap"
 
@@ -98,18 +100,16 @@ class RecordingFolder:
         """Return whether a segment of this size (bytes) and length is to end."""
         return size >= self.budget.segment_MB * MB or lasted_s >= self.budget.segment_minutes * 60.0
 
-    def room(self, needed_bytes: int) -> str:
-        """Prune where the disk is short of `needed_bytes`, and return why there is still no room; empty
-        where there is."""
-        if shutil.disk_usage(self.path).free >= self.budget.free_MB * MB + needed_bytes:
-            return ""
-        return self.make_room(needed_bytes)
+    def require_room(self, needed_bytes: int) -> None:
+        """Prune where the disk is short of `needed_bytes`. Raises NoRoomError."""
+        if shutil.disk_usage(self.path).free < self.budget.free_MB * MB + needed_bytes:
+            self._make_room(needed_bytes)
 
-    def make_room(self, coming_bytes: float) -> str:
-        """Prune for `coming_bytes` more within the budget, and return why they do not fit; empty where they do."""
+    def _make_room(self, coming_bytes: float) -> None:
         self.prune(coming_bytes)
-        over = self._over(self.segments(), coming_bytes)
-        return f"No space left on device: {over}, and nothing unmarked is left that would help" if over else ""
+        if over := self.over(self.segments(), coming_bytes):
+            said = f"No space left on device: {over}, and nothing unmarked is left that would help"
+            raise NoRoomError(errno.ENOSPC, said)
 
     def prune(self, coming_bytes: float = 0.0) -> list[Segment]:
         """Delete segments too old, and, where that helps, the oldest until `coming_bytes` more fit budget and
@@ -117,9 +117,9 @@ class RecordingFolder:
         left, gone = self.segments(), []
         old, may_go = set(self._too_old(left)), [each for each in left if each.may_go]
         stay = [each for each in left if not each.may_go]
-        helps = not self._over(stay, coming_bytes, sum(each.bytes for each in may_go))
+        helps = not self.over(stay, coming_bytes, sum(each.bytes for each in may_go))
         for segment in may_go:
-            if (segment in old or (helps and self._over(left, coming_bytes))) and self._delete(segment):
+            if (segment in old or (helps and self.over(left, coming_bytes))) and self._delete(segment):
                 left.remove(segment)
                 gone.append(segment)
         return gone
@@ -145,7 +145,7 @@ class RecordingFolder:
                 mark(known[place - 1].path)
         return marked
 
-    def _over(self, left: list[Segment], coming_bytes: float, freed_bytes: float = 0.0) -> str:
+    def over(self, left: list[Segment], coming_bytes: float = 0.0, freed_bytes: float = 0.0) -> str:
         """Say why `coming_bytes` beside the segments `left` break the budget or the disk's reserve; empty where they do
         not."""
         coming_MB, free_MB = coming_bytes / MB, (shutil.disk_usage(self.path).free + freed_bytes) / MB

@@ -10,7 +10,6 @@ import hashlib
 import math
 import os
 import re
-import select
 import signal
 import socket
 import stat
@@ -38,7 +37,6 @@ OWN_NAME = re.compile(r"\d{8}T\d{6}\.\d{3}Z-([A-Z_-]+)\.mcap")
 MAX_FILES = 20
 "Of faults, and of requests; the oldest goes."
 MAX_PACKET = 1_000_000
-LOOK_S = 0.05
 DIED = "DAEMON-DIED"
 SHARED_MEMORY = "/dev/shm"
 LENGTH = struct.Struct("<I")
@@ -47,14 +45,11 @@ END = LENGTH.pack(0)
 SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 
-class Begin(msgspec.Struct, frozen=True, array_like=True, tag="begin"):
-    """What begins a half of a ring, and a scene in it: the folder for black boxes, and the header of each."""
-
-    folder: str
-    header: dict[str, str]
+Header = dict[str, str]
+"What a half of a ring begins with, and each scene in it: a black box's metadata, and the `folder` for it."
 
 
-class Part(msgspec.Struct, frozen=True, array_like=True, tag="part"):
+class Part(msgspec.Struct, frozen=True, array_like=True):
     """Some control periods, as entries of `stream.py`; the time is the last period's."""
 
     time_s: float
@@ -62,12 +57,11 @@ class Part(msgspec.Struct, frozen=True, array_like=True, tag="part"):
 
 
 class Write(msgspec.Struct, frozen=True, array_like=True, tag="write"):
-    """Request to write what the ring has in `after_s` to a file, which gets this header: more than its scene's."""
+    """Request to write what the ring has to a file, which gets this header: more than its scene's."""
 
     path: str
     reason: str
-    after_s: float
-    header: dict[str, str]
+    header: Header
 
 
 class End(msgspec.Struct, frozen=True, array_like=True, tag="end"):
@@ -105,41 +99,37 @@ class Ring:
     def __init__(self, file: int | None = None, kept_s: float = KEPT_S, most_bytes: int = MAX_BYTES) -> None:
         self.file = os.memfd_create("tormagd", os.MFD_CLOEXEC) if file is None else file
         self._kept_s, self._most_bytes = kept_s, most_bytes // 2
-        self._begun, self._is_begun = Begin("", {}), False
+        self._header: Header | None = None
         self._half = self._at = self._bytes = 0
         self._first_s = math.inf
 
-    def begin(self, begun: Begin) -> None:
-        """Begin a scene: parts belong to the newest one before them."""
-        self._begun, self._is_begun = begun, False
-
-    def put(self, part: Part) -> None:
-        """Add a part, which comes later than those before."""
+    def put(self, header: Header, part: Part) -> None:
+        """Add a part, which comes later than those before, and its scene's header."""
         self._first_s = min(self._first_s, part.time_s)
         if part.time_s - self._first_s > self._kept_s or self._bytes + len(part.entries) > self._most_bytes:
             self._half = 1 - self._half
             self._at = HALVES[self._half]
             os.pwrite(self.file, END, self._at)
-            self._first_s, self._bytes, self._is_begun = part.time_s, 0, False
-        if not self._is_begun:
-            self._append(self._begun)
-            self._is_begun = True
+            self._first_s, self._bytes, self._header = part.time_s, 0, None
+        if header is not self._header:
+            self._append(header)
+            self._header = header
         self._append(part)
         self._bytes += len(part.entries)
 
-    def kept(self) -> list[tuple[Begin, Part]]:
-        """List what is kept, the oldest first, each part with what began it: none over `kept_s` older than the last."""
-        found: list[tuple[Begin, Part]] = []
+    def kept(self) -> list[tuple[Header, Part]]:
+        """List what is kept, the oldest first, each part with its header: none over `kept_s` older than the last."""
+        found: list[tuple[Header, Part]] = []
         for at in HALVES:
-            begun = Begin("", {})
+            header: Header = {}
             with contextlib.suppress(msgspec.MsgspecError, struct.error):  # it was killed in the midst of a part
                 while length := LENGTH.unpack(os.pread(self.file, LENGTH.size, at))[0]:
-                    said = msgspec.msgpack.decode(os.pread(self.file, length, at + LENGTH.size), type=Begin | Part)
+                    said = msgspec.msgpack.decode(os.pread(self.file, length, at + LENGTH.size), type=Header | Part)
                     at += LENGTH.size + length
-                    if isinstance(said, Begin):
-                        begun = said
+                    if isinstance(said, Part):
+                        found.append((header, said))
                     else:
-                        found.append((begun, said))
+                        header = said
         found.sort(key=lambda each: each[1].time_s)
         return [each for each in found if found[-1][1].time_s - each[1].time_s <= self._kept_s]
 
@@ -161,7 +151,7 @@ class Ring:
                     yield Ring(file)
                     path.unlink()
 
-    def _append(self, what: Begin | Part) -> None:
+    def _append(self, what: Header | Part) -> None:
         data = msgspec.msgpack.encode(what)
         # whoever reads meanwhile finds the end before it, or all of it
         os.pwrite(self.file, data + END, self._at + LENGTH.size)
@@ -174,46 +164,31 @@ class Keeper:
 
     def __init__(self, its: socket.socket, ring: Ring) -> None:
         self._socket, self._ring = its, ring
-        self._due: list[tuple[float, Write]] = []
         self._written: deque[str] = deque(maxlen=2 * MAX_FILES)
 
     def run(self) -> None:
-        """Write black boxes until the daemon ends, then all that are still due, and return."""
+        """Write black boxes until the daemon ends."""
         for left in self._ring.left():
             self._write_of_a_dead(left)
-        while self._hear():
-            due = next((each for each in self._due if each[0] <= time.monotonic()), None)
-            if due is not None:
-                self._due.remove(due)
-                self._write(due[1], self._ring)
-        for _, write in self._due:
-            self._write(write, self._ring)
+        while isinstance(said := self._heard(), Write):
+            self._write(said, self._ring)
+        if said is None:
+            self._write_of_a_dead(self._ring)
         self._ring.path.unlink(missing_ok=True)
 
-    def _hear(self) -> bool:
-        """Wait for a word of the daemon and take it; return whether the daemon goes on."""
-        ready, _, _ = select.select([self._socket], [], [], LOOK_S if self._due else None)
-        if not ready:
-            return True
+    def _heard(self) -> Write | End | None:
+        """Wait for a word of the daemon; None where it has died."""
         try:
             data = self._socket.recv(MAX_PACKET)
         except OSError:
             data = b""
-        if not data:
-            self._write_of_a_dead(self._ring)
-            return False
-        said = msgspec.msgpack.decode(data, type=Write | End)
-        if isinstance(said, End):
-            return False
-        self._due.append((time.monotonic() + said.after_s, said))
-        self._due.sort(key=lambda each: each[1].reason == REQUEST)  # a fault's go first
-        return True
+        return msgspec.msgpack.decode(data, type=Write | End) if data else None
 
     def _write_of_a_dead(self, ring: Ring) -> None:
         """Write what the ring of a daemon has that did not say that it ends."""
         if kept := ring.kept():
-            begun, _ = kept[-1]
-            self._write(Write(str(box_path(begun.folder, DIED)), DIED, 0.0, begun.header), ring)
+            header, _ = kept[-1]
+            self._write(Write(str(box_path(header["folder"], DIED)), DIED, header), ring)
 
     def _write(self, write: Write, ring: Ring) -> None:
         """Write one black box, unless it is there, and answer the daemon."""
@@ -233,7 +208,7 @@ class Keeper:
         """Write a black box, and delete the oldest of its kind beyond MAX_FILES."""
         from tormagd.record.writer import write_black_box
 
-        parts = [part.entries for begun, part in ring.kept() if begun.header.items() <= write.header.items()]
+        parts = [part.entries for header, part in ring.kept() if header.items() <= write.header.items()]
         if not parts:
             raise OSError(0, "nothing is kept yet")
         path.parent.mkdir(mode=0o750, parents=True, exist_ok=True)

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from tormagd.record.force_following import PERIOD_S, Following
 from tormagd_client.messages import FollowingReport, Mark
+from tormagd_client.printable import require
 
 Floats = NDArray[np.float64]
 
@@ -117,6 +118,11 @@ class Overview(msgspec.Struct, frozen=True, kw_only=True):
     late_counts: Annotated[list[int], Meta(min_length=len(LATE_US) + 1, max_length=len(LATE_US) + 1)]
     marks: Annotated[list[Mark], Meta(max_length=MAX_MARKS)]
 
+    def __post_init__(self) -> None:
+        is_even = not len(self.stretches) % 8 and len(self.sides) == len(QUANTITIES) * len(self.stretches)
+        require(is_even, "stretches and sides", len(self.sides), "curves of equal length")
+        require(set(self.codes) == set(KINDS), "codes", list(self.codes)[:4], ", ".join(KINDS))
+
     @property
     def duration_s(self) -> float:
         return (self.end_ns - self.start_ns) * 1e-9
@@ -139,22 +145,13 @@ class Overview(msgspec.Struct, frozen=True, kw_only=True):
         known = self.codes.get(kind, {})
         return {code: [(a * 1e-9, b * 1e-9) for a, b in each.spans_ns] for code, each in known.items()}
 
-    def packed(self) -> bytes:
-        return msgspec.msgpack.encode(self)
-
 
 def unpacked(data: bytes) -> Overview:
-    if len(data) > MAX_BYTES:
-        raise ValueError(f"an overview of {len(data)} bytes: allowed is {MAX_BYTES}")
+    require(len(data) <= MAX_BYTES, "its overview", len(data), f"{MAX_BYTES} bytes")
     try:
-        found = msgspec.msgpack.decode(data, type=Overview)
+        return msgspec.msgpack.decode(data, type=Overview)
     except (msgspec.MsgspecError, RecursionError) as error:
         raise ValueError(f"its overview: {error}") from error
-    if len(found.stretches) % 8 or len(found.sides) != len(QUANTITIES) * len(found.stretches):
-        raise ValueError("its overview: curves of unequal length")
-    if set(found.codes) != set(KINDS):
-        raise ValueError(f"its overview: allowed are codes of {', '.join(KINDS)}")
-    return found
 
 
 class OverviewBuilder:

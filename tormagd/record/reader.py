@@ -11,15 +11,15 @@ import struct
 import zlib
 from collections import deque
 from collections.abc import Callable, Iterator
+from itertools import islice
 from pathlib import Path
 from typing import Any, BinaryIO, NamedTuple
 
 import msgspec
 from mcap.exceptions import McapError
-from mcap.reader import FOOTER_SIZE
+from mcap.reader import FOOTER_SIZE, SeekingReader
 from mcap.records import (
     Attachment,
-    AttachmentIndex,
     Channel,
     Chunk,
     ChunkIndex,
@@ -28,7 +28,6 @@ from mcap.records import (
     McapRecord,
     Message,
     Metadata,
-    MetadataIndex,
 )  # fmt: skip
 from mcap.stream_reader import MAGIC_SIZE, StreamReader, breakup_chunk
 from mcap.writer import MCAP0_MAGIC
@@ -39,13 +38,13 @@ from tormagd.record.stream import MISSING
 from tormagd.record.writer import (
     CORE_TOPIC,
     CUT,
-    FRAMES_TOPIC,
     NUMBER_COLUMN,
     OVERVIEW,
     TELEMETRY_TOPIC,
     THINNED,
     TICKS_TOPIC,
     Derived,
+    Shown as Shown,
     is_tick,
 )
 from tormagd_client.printable import printable
@@ -59,14 +58,13 @@ MAX_RATIO, FREE_BYTES = 100, 16_000_000
 MAX_WINDOW_BYTES = 1 << 24
 DATA_END_BYTES = 13
 BLOCK_BYTES = 1 << 20
-MAX_INDEX = 1_000_000
-"Chunks of one file: some days."
+MAX_SUMMARY_BYTES = 64_000_000
+"The chunks of two days."
 MAX_SEEN = 400_000
 "Messages read at once: at 4 kHz more than a minute."
 END_NS = 2**64 - 1
 MAX_CORE_BYTES, MAX_ENTRIES = 50_000_000, 1_000_000
 "Bounds on what is read of one file, a minute of 1 kHz; what comes after is passed over."
-NO_BLACK_BOX = f"no black box of tormagd: it has nothing in {CORE_TOPIC}, or not what a replay needs"
 TOPICS = (TELEMETRY_TOPIC, TICKS_TOPIC)
 UNREADABLE = (
     McapError, ZstdError, EOFError, ValueError, OverflowError, MemoryError, RecursionError, struct.error,
@@ -77,14 +75,6 @@ UNREADABLE = (
 
 class RecordingError(ValueError):
     """A file that is not a readable recording; the text names the file and what is wrong."""
-
-
-class Seen(NamedTuple):
-    """A control tick or a snapshot, with the fields that were wanted; its time is ns since 1970."""
-
-    t_ns: int
-    is_tick: bool
-    message: Any
 
 
 @contextlib.contextmanager
@@ -102,22 +92,24 @@ def readable(name: str) -> Iterator[None]:
     """Turn any of UNREADABLE into a RecordingError that names the file."""
     try:
         yield
-    except RecordingError:
-        raise
     except UNREADABLE as error:
-        raise RecordingError(f"{name}: not an intact MCAP file ({str(error)[:200]})") from error
+        raise RecordingError(f"{name}: not an intact MCAP file of tormagd ({str(error)[:200]})") from error
 
 
 class _Bounded:
-    """A file for an MCAP reader, which may read `left` more bytes."""
+    """A file for an MCAP reader, which may read `most` bytes of one place, and `left` more."""
 
-    def __init__(self, file: BinaryIO) -> None:
-        self._file, self.left = file, MAX_RECORD_BYTES
+    def __init__(self, file: BinaryIO, most: int = MAX_RECORD_BYTES) -> None:
+        self._file, self._most, self.left = file, most, most
+
+    def seek(self, at: int, whence: int = 0) -> int:
+        self.left = self._most
+        return self._file.seek(at, whence)
 
     def read(self, size: int) -> bytes:
         self.left -= size
         if self.left < 0:
-            raise ValueError(f"a record of over {MAX_RECORD_BYTES} bytes")
+            raise ValueError(f"records of over {self._most} bytes")
         data = self._file.read(size)
         if len(data) < size:
             raise EOFError("it ends within a record")
@@ -157,19 +149,18 @@ def _at(file: BinaryIO, at: int, kind: type[Any]) -> Any:
     return record
 
 
-def _end(file: BinaryIO) -> tuple[Footer | None, int]:
-    at = max(0, file.seek(0, 2) - FOOTER_SIZE - MAGIC_SIZE)
-    file.seek(at)
-    footer = _at(file, at, Footer) if file.read().endswith(MCAP0_MAGIC) else None
-    return (footer if footer and footer.summary_start else None), at
+def _is_ended(file: BinaryIO) -> bool:
+    file.seek(max(0, file.seek(0, 2) - MAGIC_SIZE))
+    return file.read() == MCAP0_MAGIC
 
 
 def damage_in(file: BinaryIO) -> str:
     """Say which CRC of a closed MCAP file is wrong; empty for none, and for a file cut short."""
     try:
-        footer, at = _end(file)
-        if footer is None:
+        if not _is_ended(file):
             return ""
+        at = max(0, file.seek(0, 2) - FOOTER_SIZE - MAGIC_SIZE)
+        footer = _at(file, at, Footer)
         data_end_at = footer.summary_start - DATA_END_BYTES
         if _at(file, data_end_at, DataEnd).data_section_crc not in (0, _crc(file, 0, data_end_at)):
             return "the CRC of its data is wrong"
@@ -199,8 +190,7 @@ class Place(NamedTuple):
 class Contents:
     """What is in an MCAP file: topics, metadata, where its chunks are, and which of those read are damaged."""
 
-    def __init__(self, file: BinaryIO, name: str) -> None:
-        self._name = name
+    def __init__(self, file: BinaryIO) -> None:
         self.topics: dict[int, str] = {}
         self.metadata: dict[str, str] = {}
         self.places: list[Place] = []
@@ -216,22 +206,15 @@ class Contents:
 
     def _read_summary(self, file: BinaryIO) -> bool:
         """Read what stands at the end, and return whether all of that is there."""
-        told: list[int] = []
         with contextlib.suppress(*UNREADABLE):
-            footer, _ = _end(file)
-            if footer is None:
+            reader = SeekingReader(_Bounded(file, MAX_SUMMARY_BYTES), record_size_limit=MAX_RECORD_BYTES)  # type: ignore[arg-type]
+            summary = reader.get_summary()
+            if summary is None or not _is_ended(file):
                 return False
-            file.seek(footer.summary_start)
-            for record in _records(file):
+            for record in (*summary.channels.values(), *reader.iter_metadata(), *summary.chunk_indexes):
                 self._take(record, 0)
-                if isinstance(record, MetadataIndex):
-                    told.append(record.offset)
-                elif isinstance(record, AttachmentIndex) and record.name == OVERVIEW:
-                    self._overview_at = record.offset
-            for at in told:
-                self._take(_at(file, at, Metadata), at)
+            self._overview_at = next((each.offset for each in summary.attachment_indexes if each.name == OVERVIEW), 0)
             return True
-        self.places = []
         return False
 
     def _look_for_chunks(self, file: BinaryIO) -> None:
@@ -252,12 +235,12 @@ class Contents:
             self.topics[record.id] = record.topic
         elif isinstance(record, Metadata):
             self.metadata.update(record.metadata)
-        elif isinstance(record, Chunk | ChunkIndex) and len(self.places) < MAX_INDEX:
+        elif isinstance(record, Chunk | ChunkIndex):
             at = record.chunk_start_offset if isinstance(record, ChunkIndex) else at
             self.places.append(Place(record.message_start_time, record.message_end_time, at))
 
-    def messages(self, file: BinaryIO, from_ns: int = 0, to_ns: int = END_NS) -> Iterator[tuple[str, Message]]:
-        """Yield the messages, with their topics, of the chunks that have some of this time, and are not damaged."""
+    def messages(self, file: BinaryIO, from_ns: int = 0, to_ns: int = END_NS) -> Iterator[Shown]:
+        """Yield the messages, undecoded, of the chunks that have some of this time, and are not damaged."""
         if not self.places:
             self._look_for_chunks(file)
         size = 0
@@ -276,22 +259,22 @@ class Contents:
             for record in records:
                 self._take(record, place.at)
                 if isinstance(record, Message):
-                    yield self.topics.get(record.channel_id, ""), record
+                    topic = self.topics.get(record.channel_id, "")
+                    yield Shown(topic, record.log_time, record.sequence, record.data)
 
-    def read(self, file: BinaryIO, wanted: Any, *times_ns: int) -> Iterator[Seen]:
-        """Yield the ticks and snapshots of `messages`, decoded as `wanted`."""
+    def read(self, file: BinaryIO, wanted: Any, from_ns: int = 0, to_ns: int = END_NS) -> Iterator[Shown]:
+        """Yield the ticks and snapshots from `from_ns` to `to_ns`, inclusive, decoded as `wanted`."""
         decode = msgspec.json.Decoder(wanted).decode
-        for topic, sent in self.messages(file, *times_ns):
-            if topic in TOPICS:
-                yield Seen(sent.log_time, topic == TICKS_TOPIC, decode(sent.data))
+        for topic, t_ns, sequence, data in self.messages(file, from_ns, to_ns):
+            if topic in TOPICS and from_ns <= t_ns <= to_ns:
+                yield Shown(topic, t_ns, sequence, decode(data))
         if len(self.lost) == len(self.places) > 0:
             raise ValueError(next(iter(self.lost.values())))
         self._require_topics()
 
     def _require_topics(self) -> None:
         if set(self.topics.values()).isdisjoint(TOPICS):
-            said = f"no channel {TELEMETRY_TOPIC} or {TICKS_TOPIC} in it; `tormagctl record` makes one"
-            raise RecordingError(f"{self._name}: {said}")
+            raise ValueError(f"no channel {TELEMETRY_TOPIC} or {TICKS_TOPIC} in it; `tormagctl record` makes one")
 
     def read_overview(self, file: BinaryIO) -> Overview | None:
         """Read the overview of a closed file, if there is one."""
@@ -307,16 +290,16 @@ class Contents:
             return None
 
 
-def read_open(file: BinaryIO, name: str, wanted: Any, each: Callable[[Seen], None]) -> Contents:
+def read_open(file: BinaryIO, name: str, wanted: Any, each: Callable[[Shown], None]) -> Contents:
     """Read an open recording: each tick and snapshot goes to `each`."""
     with readable(name):
-        found = Contents(file, name)
+        found = Contents(file)
         for seen in found.read(file, wanted):
             each(seen)
     return found
 
 
-def read_recording(path: Path, wanted: Any, each: Callable[[Seen], None]) -> Contents:
+def read_recording(path: Path, wanted: Any, each: Callable[[Shown], None]) -> Contents:
     """Read the recording in `path`: each tick and snapshot, decoded as `wanted`, goes to `each`."""
     with opened(path) as file:
         return read_open(file, str(path), wanted, each)
@@ -328,13 +311,13 @@ class RecordingFile(Contents):
     def __init__(self, path: Path) -> None:
         self.path, self.name = path, printable(path.name)
         with opened(path) as file:
-            super().__init__(file, str(path))
+            super().__init__(file)
             self.damage = damage_in(file)
             overview = None if self.damage else self.read_overview(file)
             if overview is None:
                 builder = OverviewBuilder()
                 for seen in self.read(file, Glance):
-                    builder.add(*seen)
+                    builder.add(seen.t_ns, seen.is_tick, seen.message)
                 overview = builder.made()
         self.overview, lost, known = overview, list(self.lost.values()), self.metadata
         self.notes = [
@@ -345,15 +328,12 @@ class RecordingFile(Contents):
         ]
         "What its reader has to know, in words."
 
-    def between(self, from_ns: int, to_ns: int, wanted: Any) -> list[Seen]:
+    def between(self, from_ns: int, to_ns: int, wanted: Any) -> list[Shown]:
         """Return the ticks and snapshots from `from_ns` to `to_ns`, inclusive, in the file's order."""
-        found: list[Seen] = []
         with opened(self.path) as file:
-            for seen in self.read(file, wanted, from_ns, to_ns):
-                if from_ns <= seen.t_ns <= to_ns:
-                    found.append(seen)
-                if len(found) > MAX_SEEN:
-                    raise ValueError(f"over {MAX_SEEN} messages in {(to_ns - from_ns) * 1e-9:.0f} s")
+            found = list(islice(self.read(file, wanted, from_ns, to_ns), MAX_SEEN + 1))
+            if len(found) > MAX_SEEN:
+                raise ValueError(f"over {MAX_SEEN} messages in {(to_ns - from_ns) * 1e-9:.0f} s")
         return found
 
 
@@ -367,20 +347,19 @@ class BlackBoxFile(Contents):
     def __init__(self, path: Path) -> None:
         self.path, self.entries = path, list[Any]()
         self.odd, self._is_over = "", False
-        "The first message of another topic that `/core` does not give, or why an entry of `/core` gives none."
-        topics = TICKS_TOPIC, FRAMES_TOPIC, TELEMETRY_TOPIC
-        self._expected: dict[str, deque[tuple[int, int, bytes]]] = {topic: deque() for topic in topics}
+        "The first message of another topic that is not what `/core` gives, or why an entry of `/core` gives none."
+        self._expected: deque[Shown] = deque()
         self._derived, self._size = Derived(), 0
         self._tick: int | None = None
         with opened(path) as file:
-            super().__init__(file, str(path))
+            super().__init__(file)
             self._read_core(file)
             damage = damage_in(file)
         if not self.entries:
-            raise RecordingError(f"{path}: {NO_BLACK_BOX}")
-        for topic, expected in self._expected.items() if self.is_complete else ():
-            if expected:
-                self._note(f"message {expected[0][0]} is missing in {topic}, and {CORE_TOPIC} has it")
+            said = f"no black box of tormagd: it has nothing in {CORE_TOPIC}, or not what a replay needs"
+            raise RecordingError(f"{path}: {said}")
+        if self._expected and self.is_complete and not self.lost:
+            self._compare(self._expected[0], None)
         self._note(damage)
 
     @property
@@ -392,17 +371,18 @@ class BlackBoxFile(Contents):
 
     def _read_core(self, file: BinaryIO) -> None:
         """Keep the entries of `/core`, and compare what is derived of them, as far as no chunk is lost."""
-        for topic, sent in self.messages(file):
+        for sent in self.messages(file):
             if "format" not in self.metadata or self._is_over:
                 return  # before all of a long recording has been read
-            if self.lost:
-                self._expected.clear()
-            if topic == CORE_TOPIC:
-                self._part(msgspec.json.decode(self.metadata.get("columns", "[]"), type=tuple[str, ...]), sent.data)
-            elif topic in self._expected and not self.odd:
-                expected = self._expected[topic]
-                if not expected or (sent.sequence, sent.log_time, sent.data) != expected.popleft():
-                    self._note(f"message {sent.sequence} in {topic} is not what {CORE_TOPIC} has")
+            if sent.topic == CORE_TOPIC:
+                self._part(msgspec.json.decode(self.metadata.get("columns", "[]"), type=tuple[str, ...]), sent.message)
+            elif not self.lost:
+                self._compare(sent, self._expected.popleft() if self._expected else None)
+
+    def _compare(self, sent: Shown, expected: Shown | None) -> None:
+        if sent != expected:
+            other = expected or sent
+            self._note(f"message {other.sequence} in {other.topic} is not what {CORE_TOPIC} has")
 
     def _part(self, columns: tuple[str, ...], data: bytes) -> None:
         entries, self._size = msgspec.msgpack.decode(data, type=list[Any]), self._size + len(data)
@@ -411,8 +391,8 @@ class BlackBoxFile(Contents):
             return
         try:
             self._join([each[columns.index(NUMBER_COLUMN)] for each in entries if is_tick(each)])
-            for topic, t_ns, number, shown in self._derived.of(columns, entries) if self._expected else ():
-                self._expected[topic].append((number, t_ns, msgspec.json.encode(shown)))
+            for shown in () if self.lost else self._derived.of(columns, entries):
+                self._expected.append(shown._replace(message=msgspec.json.encode(shown.message)))
         except (ValueError, TypeError, AttributeError, OverflowError, LookupError) as error:
             self._note(f"{CORE_TOPIC}: {str(error)[:100]}")
         self.entries.extend(entries)
@@ -427,4 +407,4 @@ class BlackBoxFile(Contents):
 def overview_of(path: Path) -> Overview | None:
     """Read the overview at the end of the file, if there is one."""
     with opened(path) as file:
-        return Contents(file, str(path)).read_overview(file)
+        return Contents(file).read_overview(file)

@@ -13,24 +13,19 @@ from typing import Any, NamedTuple
 import msgspec
 
 from firmware_protocol.build import settle
-from firmware_protocol.codec import DeviceFault, DeviceMode, Identity, Message, Sense, State, Status, Switches
-from firmware_protocol.framing import Frame, FramingStatistics
+from firmware_protocol.codec import Message
 from tormagd import __version__
 from tormagd.config import Config, Device, checked
 from tormagd.control.assembly.build import Core, build_core, platform_name, sources_hash
-from tormagd.control.believe.believe import Learned
 from tormagd.control.believe.sensor import Disputed
 from tormagd.control.core import PLAN_ERRORS
-from tormagd.control.records import Duty, TimedSetpoint
+from tormagd.control.records import Duty, Plan, TimedSetpoint
 from tormagd.control.safety.codes import Fault, Limit
 from tormagd.control.safety.operating_state import RefusedError
-from tormagd.element.inverse.solution import Answer
-from tormagd.ground.plain_values import first_difference, kinds, packed, plain, restore, restored
+from tormagd.ground.plain_values import first_difference, packed, plain, restore, restored
 from tormagd.hardware import connection
 from tormagd.hardware.backend import BackendError, Sent, Stream
-from tormagd.hardware.link import LinkState
-from tormagd.hardware.link_statistics import LinkQuality
-from tormagd.hardware.measurement import DeviceRequest, Measurement
+from tormagd.hardware.measurement import Measurement
 from tormagd.hardware.streams import CanStream, FrameStream, SecondHostError
 from tormagd.record import stream
 from tormagd.record.reader import BlackBoxFile
@@ -129,12 +124,6 @@ def differences(header: dict[str, str]) -> list[str]:
     return found
 
 
-KNOWN_OF_LINK = kinds(
-    *(LinkState, DeviceRequest, Identity, State, Sense, Status, DeviceMode, Switches, DeviceFault),
-    *(LinkQuality, Frame, FramingStatistics),
-)
-
-
 class Found(msgspec.Struct, frozen=True):
     """The first difference: its field, both values, and the frame that it belongs to. `tick` counts from 1, `time_s`
     from the file's first tick."""
@@ -147,62 +136,41 @@ class Found(msgspec.Struct, frozen=True):
     time_s: float = 0.0
 
 
-def differing(where: str, recorded: Any, replayed: Any, frame: int | None = None) -> Found | None:
-    """Return the first difference between two plain values, its field prefixed with `where`."""
+class DifferenceError(Exception):
+    """What is run differs from what was recorded, as the argument tells, which is Found."""
+
+
+def require_same(where: str, recorded: Any, replayed: Any, frame: int | None = None) -> None:
+    """Raise DifferenceError at the first difference between two plain values, its field prefixed with `where`."""
     found = first_difference(recorded, replayed)
-    return None if found is None else Found(f"{where}.{found[0]}".strip("."), *found[1:], frame)
+    if found is not None:
+        raise DifferenceError(Found(f"{where}.{found[0]}".strip("."), *found[1:], frame))
 
 
 class Conversation:
-    def __init__(self, frame: int) -> None:
-        self._connection: connection.Connection | None = None
-        self.stream: Stream = FrameStream()
+    """The link with the device as it was when it had this `memory`; what it reads and writes is recorded."""
+
+    def __init__(self, memory: Any) -> None:
+        told = memory["stream"]
+        is_serial = FrameStream.__name__ in told
+        self.stream: Stream = FrameStream() if is_serial else CanStream(told[CanStream.__name__]["node"])
         self._unread: Sequence[Any] = ()
         self._written: list[Sent] = []
-        self.frame = frame
-        self.frames = 0
+        self.connection = connection.Connection(Device(), lambda: self, lambda: None)
+        self.connection.open(0.0)
+        self.connection.remember(memory, stream.KNOWN)
 
-    def begin(self, memory: Any) -> None:
-        self._connection = None
-        if memory is not None:
-            told = memory["stream"]
-            is_serial = FrameStream.__name__ in told
-            self.stream = FrameStream() if is_serial else CanStream(told[CanStream.__name__]["node"])
-            self._connection = own = connection.Connection(Device(), lambda: self, lambda: None)
-            own.open(0.0)
-            own.remember(memory, KNOWN_OF_LINK)
+    def read(self, now_s: float, raw: Any) -> None:
+        self._unread = raw if isinstance(raw, list) else [raw]
+        self.connection.receive(now_s)
 
-    def compare_memory(self, recorded: Any) -> Found | None:
-        """Return where the connection's memory differs from the `recorded` one."""
-        own = self._connection
-        return None if own is None else differing("state.connection", recorded, own.memory(), self.frame)
-
-    def compare(self, recorded: Measurement | None) -> Found | None:
-        """Return where the newest measurement differs from the recorded step's."""
-        own = self._connection
-        return None if own is None else differing("measurement", plain(recorded), plain(own.measurement), self.frame)
-
-    def read(self, entry: Any) -> None:
-        if self._connection is not None:
-            _, now_s, raw = entry
-            self._unread = pieces = raw if isinstance(raw, list) else [raw]
-            self._connection.receive(now_s)
-            self.frames += len(pieces)
-
-    def wrote(self, entry: Any, output: Duty) -> Found | None:
-        """Send a step's `output` again, and return the first frame that differs from the WROTE entry's."""
-        if self._connection is None:
-            return None
-        _, now_s, recorded, unsent = entry
+    def write(self, now_s: float, unsent: int, output: Duty) -> list[Sent]:
+        """Send a step's `output` again, and return the frames."""
         self._written, self.stream.statistics.unsent = [], unsent
-        self._connection.exchange(
+        self.connection.exchange(
             now_s, output.left_duty, output.right_duty, output.mode, output.request, output.request_number
         )
-        for number, (told, own) in enumerate(zip_longest(recorded, self._written), self.frame - len(recorded) + 1):
-            if packed(told) != packed(own):
-                return Found("written", _shown(told), _shown(own), number)
-        self.frames += len(recorded)
-        return None
+        return self._written
 
     def receive(self) -> list[Message]:
         """Decode what `read` was last given; empty when called again."""
@@ -283,33 +251,27 @@ def rerun(core: Core, entries: list[Any], from_s: float = 0.0) -> Rerun:
     lasts_s = records[places[-1]].monotonic_s - first_s
     if not 0.0 <= from_s <= lasts_s:
         raise ReplayError(f"--from = {from_s:g}: allowed is 0..{lasts_s:.3f} s")
-    start = _start(entries, records, first_s + from_s)
-    try:
-        running = _Running(core, sum(len(frames_in(entry)) for entry in entries[:start]))
-    except (ValueError, TypeError) as error:
-        raise ReplayError(f"before the start: no frames: {_short(error)}") from error
-    number = bisect_right(places, start)
+    at = _start(entries, records, first_s + from_s)
+    number = bisect_right(places, at)
     from_s, agreed, to_s = records[places[number]].monotonic_s - first_s, 0, 0.0
     difference: Found | None = None
-    for place in range(start, places[-1] + 1):
-        # a step's inputs are in the record of its period, which comes after the period's other entries
-        record = records[places[number]]
-        time_s = record.monotonic_s - first_s
-        try:
-            differs = running.compare(record) if place in records else running.take(entries[place], record)
-        except UNTAKEN as error:
-            raise ReplayError(
-                f"tick {number + 1}: the core does not take what stands there: {_short(error)}"
-            ) from error
-        if differs is not None:
-            told = {"recorded": _short(differs.recorded), "replayed": _short(differs.replayed)}
-            difference = msgspec.structs.replace(differs, tick=number + 1, time_s=round(time_s, 6), **told)
-            break
-        if place in records:
+    running = _Running(core)
+    try:
+        running.frame = sum(len(frames_in(entry)) for entry in entries[:at])
+        for place in places[number:]:
             number += 1
+            time_s = records[place].monotonic_s - first_s
+            running.run(entries[at:place], records[place])
+            at = place + 1
             if running.is_known:
                 agreed, to_s = agreed + 1, time_s
-    return Rerun(agreed, from_s, to_s, running.snapshots, running.gaps, running.conversation.frames, difference)
+    except DifferenceError as error:
+        (found,) = error.args
+        told = {"recorded": _short(found.recorded), "replayed": _short(found.replayed)}
+        difference = msgspec.structs.replace(found, tick=number, time_s=round(time_s, 6), **told)
+    except UNTAKEN as error:
+        raise ReplayError(f"tick {number}: the core does not take what stands there: {_short(error)}") from error
+    return Rerun(agreed, from_s, to_s, running.snapshots, running.gaps, running.frames, difference)
 
 
 def _start(entries: list[Any], records: dict[int, Any], until_s: float) -> int:
@@ -323,116 +285,131 @@ def _start(entries: list[Any], records: dict[int, Any], until_s: float) -> int:
 
 
 class _Running:
-    def __init__(self, core: Core, frame: int) -> None:
-        self.conversation, self._core = Conversation(frame), stream.core_hash(core.config, core.scene, core.model)
-        self._of_frames: Found | None = None
+    def __init__(self, core: Core) -> None:
+        self._core = stream.core_hash(core.config, core.scene, core.model)
         self._stepper, self._planner = core.stepper(), core.planner()
-        self._used = self._planner.planned
+        self._ran: tuple[Duty, Plan, Measurement | None] | None = None
+        "Output, plan and measurement of the newest step."
+        self._link: Conversation | None = None
+        self._of_frames: list[tuple[str, Any, Any, int]] = []
+        "What the frames give, as recorded and replayed: a tick's columns are compared before."
         self._failure: Exception | None = None
-        self._output: Duty | None = None
-        self._measurement: Measurement | None = None
         self.is_known = False
-        self.snapshots = self.gaps = 0
+        self.frame = self.frames = self.snapshots = self.gaps = 0
 
-    def take(self, entry: Any, record: Any) -> Found | None:
-        """Take one entry that is no tick, and return the first difference."""
-        name = name_of(entry)
-        self.conversation.frame += len(frames_in(entry))
-        if name == stream.STATE:
-            return self._begin(entry)
-        if name == stream.MISSING:
-            self.gaps += self.is_known
-            self.is_known = False
-            self.conversation.begin(None)
-        elif name == connection.READ:
-            self.conversation.read(entry)
-        elif name == connection.CONNECTED:
-            self.conversation.begin(entry[1])
-        elif self.is_known and name != stream.TOLD:
-            return self._run(name, entry, record)
-        return None
+    def run(self, entries: list[Any], record: Any) -> None:
+        """Run the entries of one control period, whose tick comes after them. Raises DifferenceError."""
+        for entry in entries:
+            name, frames = name_of(entry), len(frames_in(entry))
+            self.frame += frames
+            if name == stream.STATE:
+                self._begin(*entry[1:])
+            elif name == stream.MISSING:
+                self.gaps += self.is_known
+                self.is_known = False
+            elif self.is_known:
+                self.frames += frames
+                self._take(name, entry, record)
+        if self.is_known:
+            self._compare(record)
 
-    def _run(self, name: str, entry: Any, record: Any) -> Found | None:
-        """Do what one entry tells: step, plan, learning, command or fault."""
+    def _take(self, name: str, entry: Any, record: Any) -> None:
+        """Do what one entry tells: a step, something of the link, or something of the core."""
         match name:
             case stream.STEP:
-                self._measurement = stream.measurement_of(record)
-                self._of_frames = self.conversation.compare(self._measurement)
-                self._used = self._planner.planned
-                self._output = self._stepper.step(record.monotonic_s, self._measurement, self._used)
-            case connection.WROTE:
-                if self._output is None:
-                    raise ValueError("something written without a step")
-                self._of_frames = self._of_frames or self.conversation.wrote(entry, self._output)
+                self._step(record)
+            case connection.CONNECTED:
+                self._link = None if entry[1] is None else Conversation(entry[1])
+            case connection.READ if self._link is not None:
+                self._link.read(*entry[1:])
+            case connection.WROTE if self._link is not None:
+                self._write(self._link, *entry[1:])
+            case stream.LOSE_LINK:
+                self._stepper.lose_link()
+            case stream.TOLD:
+                pass
+            case _:
+                self._run(name, entry)
+
+    def _run(self, name: str, entry: Any) -> None:
+        """Do what one entry of the core tells: plan, learning, command or fault."""
+        match name:
             case stream.PLAN:
-                now_s, timed = planned_for(entry)
-                try:
-                    self._planner.plan(now_s, timed, self._stepper.measured, self._stepper.is_followed)
-                except PLAN_ERRORS as error:
-                    self._failure = error
+                self._plan(*planned_for(entry))
             case stream.FORESEE:
                 self._planner.governor.foresee()
             case stream.AFRESH:
                 self._failure = None
                 self._planner.afresh(msgspec.convert(entry[1], float))
-            case stream.TEACH | stream.ANSWER:
-                match restored(entry[1], stream.KNOWN):
-                    case Learned() as learned:
-                        self._planner.believe.teach(learned)
-                    case Answer() as answer:
-                        self._planner.aim.answer = answer
-                    case other:
-                        raise ValueError(f"{other!r}: allowed is what is learned of a device, or what a search found")
+            case stream.TEACH:
+                self._planner.believe.teach(restored(entry[1], stream.KNOWN))
+            case stream.ANSWER:
+                self._planner.aim.answer = restored(entry[1], stream.KNOWN)
             case stream.CONFIRM:
                 self._planner.believe.confirm(msgspec.convert(entry[1], Disputed))
             case stream.COMMAND:
-                command, now_s, was_refused, given = msgspec.convert(entry[1:], tuple[str, float, bool, dict[str, Any]])
-                try:
-                    self._stepper.command(command, now_s, restored(given, stream.KNOWN))
-                except RefusedError as error:
-                    return None if was_refused else Found(command, "taken", f"refused: {error.message}")
-                if was_refused:
-                    return Found(command, "refused", "taken")
+                self._command(*msgspec.convert(entry[1:], tuple[str, float, bool, dict[str, Any]]))
             case stream.LATCH:
                 self._stepper.latch(Fault(entry[1]))
-            case stream.LOSE_LINK:
-                self._stepper.lose_link()
             case _:
                 raise ValueError(f"{name[:40]!r}: no entry of a black box")
-        return None
 
-    def compare(self, record: Any) -> Found | None:
-        """Return the first column that differs from the recorded tick, or else what its frames show."""
-        if not self.is_known:
-            return None
-        if self._output is None:
+    def _plan(self, now_s: float, timed: TimedSetpoint | None) -> None:
+        try:
+            self._planner.plan(now_s, timed, self._stepper.measured, self._stepper.is_followed)
+        except PLAN_ERRORS as error:
+            self._failure = error
+
+    def _step(self, record: Any) -> None:
+        measurement, plan = stream.measurement_of(record), self._planner.planned
+        told = plain(measurement)
+        own = told if self._link is None else plain(self._link.connection.measurement)
+        self._of_frames = [("measurement", told, own, self.frame)]
+        self._ran = self._stepper.step(record.monotonic_s, measurement, plan), plan, measurement
+
+    def _write(self, link: Conversation, now_s: float, recorded: list[Any], unsent: int) -> None:
+        if self._ran is None:
+            raise ValueError("something written without a step")
+        pairs = zip_longest(recorded, link.write(now_s, unsent, self._ran[0]))
+        for number, (told, own) in enumerate(pairs, self.frame - len(recorded) + 1):
+            self._of_frames.append(("written", _shown(told), _shown(own), number))
+
+    def _command(self, name: str, now_s: float, was_refused: bool, given: dict[str, Any]) -> None:
+        refusal = "taken"
+        try:
+            self._stepper.command(name, now_s, restored(given, stream.KNOWN))
+        except RefusedError as error:
+            refusal = f"refused: {error.message}"
+        if was_refused is (refusal == "taken"):
+            raise DifferenceError(Found(name, "refused" if was_refused else "taken", refusal))
+
+    def _compare(self, record: Any) -> None:
+        """Compare what is run with the recorded tick, column by column, and then what its frames gave."""
+        if self._ran is None:
             raise ValueError("a tick without a step")
-        timing = record.lateness_us, record.exec_us, record.tick
         if self._failure is not None:
-            return Found("plan", "made", f"failed: {self._failure}")
-        given = stream.Moment(self._stepper, self._output, self._used, self._measurement, *timing).row()
+            raise DifferenceError(Found("plan", "made", f"failed: {self._failure}"))
+        given = stream.Moment(self._stepper, *self._ran, record.lateness_us, record.exec_us, record.tick).row()
         left, right = msgspec.structs.astuple(record)[NOT_THE_CORES:], msgspec.structs.astuple(given)[NOT_THE_CORES:]
-        if packed(left) == packed(right):
-            return self._of_frames
-        rows = zip(stream.COLUMNS[NOT_THE_CORES:], left, right, strict=True)
-        return next(Found(*row) for row in rows if packed(row[1]) != packed(row[2]))
+        if packed(left) != packed(right):
+            rows = zip(stream.COLUMNS[NOT_THE_CORES:], left, right, strict=True)
+            raise DifferenceError(next(Found(*row) for row in rows if packed(row[1]) != packed(row[2])))
+        for pair in self._of_frames:
+            require_same(*pair)
 
-    def _begin(self, entry: Any) -> Found | None:
+    def _begin(self, step: Any, plan: Any, memory: Any, core: str) -> None:
         """Compare the states with a snapshot's, if they are known, and then take them."""
-        _, step, plan, memory, core = entry
-        if core != self._core:
-            return Found("core", core, self._core)
-        differs = None
+        require_same("core", core, self._core)
         if self.is_known:
             self.snapshots += 1
-            for what, recorded, own in (("step", step, self._stepper), ("plan", plan, self._planner)):
-                differs = differs or differing(f"state.{what}", recorded, plain(own))
-            differs = differs or self.conversation.compare_memory(memory)
-        self.conversation.begin(memory)
+            require_same("state.step", step, plain(self._stepper))
+            require_same("state.plan", plan, plain(self._planner))
+            own = None if self._link is None else self._link.connection.memory()
+            require_same("state.connection", memory, own, self.frame)
+        self._link = None if memory is None else Conversation(memory)
         restore(self._stepper, step, stream.KNOWN)
         restore(self._planner, plan, stream.KNOWN)
         self._failure, self.is_known = None, True
-        return differs
 
 
 def name_of(entry: Any) -> str:

@@ -19,7 +19,8 @@ from typing import Any, Final, final
 
 import msgspec
 
-from firmware_protocol.codec import DeviceFault, DeviceMode, Switches
+from firmware_protocol.codec import DeviceFault, DeviceMode, Identity, Sense, State, Status, Switches
+from firmware_protocol.framing import Frame, FramingStatistics
 from firmware_protocol.value import Value
 from tormagd.config import Config
 from tormagd.control.ask.forecast import Skill
@@ -35,6 +36,7 @@ from tormagd.control.safety.operating_state import Conditions, OperatingState, S
 from tormagd.element.inverse.solution import Answer, FieldSolution, Question, Reach
 from tormagd.element.model.displacement import Turn
 from tormagd.ground.plain_values import kinds, plain
+from tormagd.hardware.link import LinkState
 from tormagd.hardware.link_statistics import LinkQuality
 from tormagd.hardware.measurement import DeviceRequest, Measurement
 from tormagd.scenes.scene import Scene, Terms
@@ -43,9 +45,10 @@ from tormagd_client.messages import VERSION, BeliefReport, Telemetry, Tick
 FORMAT = 24
 "Version of entries, states and times: raised when one comes, goes or changes its meaning. No other is rerun."
 KNOWN = kinds(
-    *(SafetyState, OperatingState, DeviceRequest, Fault, Limit, Conditions, DeviceMode, Switches),
+    *(SafetyState, OperatingState, DeviceRequest, Fault, Limit, Conditions, DeviceMode, Switches, DeviceFault),
     *(Measured, Handle, Travel, Turn, TimedSetpoint, Wall, Leap, Reference, Plan, Outside),
     *(DeviceFit, Level, Learned, Skill, Question, Answer, FieldSolution, Reach),
+    *(LinkState, LinkQuality, Identity, State, Sense, Status, Frame, FramingStatistics),
 )
 "All types that `plain_values` reads back."
 STEP = "step"

@@ -30,11 +30,9 @@ class TickBatch(msgspec.Struct, frozen=True, kw_only=True):
         require(is_known, "columns", self.columns[:4], f"1..{MAX_COLUMNS} names, {TIME_COLUMN} first")
         require(len(set(self.columns)) == len(self.columns), "columns", self.columns, "each name once")
         for number, row in enumerate(self.rows):
-            if len(row) != len(self.columns):
-                raise ValueError(f"rows[{number}] has {len(row)} values: allowed is {len(self.columns)}")
-            time_ns = row[0]
-            if isinstance(time_ns, bool) or not isinstance(time_ns, int) or not 0 <= time_ns < MAX_TIME_NS:
-                raise ValueError(f"rows[{number}].{TIME_COLUMN} = {time_ns!r}: allowed is 0..2^63-1 ns since 1970")
+            require(len(row) == len(self.columns), f"rows[{number}]", len(row), f"{len(self.columns)} values")
+            is_time = type(row[0]) is int and 0 <= row[0] < MAX_TIME_NS
+            require(is_time, f"rows[{number}].{TIME_COLUMN}", row[0], "0..2^63-1 ns since 1970")
 
 
 _ENCODER, _DECODER = msgspec.msgpack.Encoder(), msgspec.msgpack.Decoder(TickBatch)
@@ -46,8 +44,6 @@ def encode_ticks(rows: Sequence[object], columns: tuple[str, ...] = COLUMNS, cor
 
 
 def decode_ticks(data: bytes) -> TickBatch:
-    if len(data) > MAX_BATCH_BYTES:
-        raise MessageError(f"tick batch of {len(data)} bytes: allowed is {MAX_BATCH_BYTES}")
     try:
         return _DECODER.decode(data)
     except (msgspec.MsgspecError, RecursionError, UnicodeDecodeError) as error:

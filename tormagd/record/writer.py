@@ -17,7 +17,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from itertools import count
 from pathlib import Path
 from types import TracebackType
-from typing import Any, NamedTuple, NoReturn, Self
+from typing import Any, NamedTuple, Self
 
 import msgspec
 from mcap.writer import Writer
@@ -26,7 +26,7 @@ from tormagd import __version__
 from tormagd.ground.files import in_place_of, new_file
 from tormagd.ground.terminal import write_line
 from tormagd.hardware.connection import READ, WROTE
-from tormagd.record.folder import RecordingFolder
+from tormagd.record.folder import NoRoomError, RecordingFolder
 from tormagd.record.overview import OverviewBuilder
 from tormagd.record.stream import COLUMNS, TOLD, kind_of
 from tormagd.record.ticks import TickBatch, Value
@@ -52,12 +52,12 @@ AROUND_S = 10.0
 AROUND_NS = round(AROUND_S * 1e9)
 
 
-def disk_room(path: Path, needed_bytes: int) -> str:
-    """Say why a disk has no room for `needed_bytes`; empty if it has."""
+def require_room(path: Path, needed_bytes: int) -> None:
+    """Raise NoRoomError where the disk has no room for `needed_bytes`."""
     free, least = shutil.disk_usage(path.parent).free, MIN_FREE_BYTES + needed_bytes
-    if free >= least:
-        return ""
-    return f"No space left on device: {free / 1e6:.1f} MB are free, needed are {least / 1e6:.1f}"
+    if free < least:
+        said = f"No space left on device: {free / 1e6:.1f} MB are free, needed are {least / 1e6:.1f}"
+        raise NoRoomError(errno.ENOSPC, said)
 
 
 class Frame(msgspec.Struct, frozen=True, omit_defaults=True):
@@ -93,6 +93,10 @@ class Shown(NamedTuple):
     t_ns: int
     sequence: int
     message: Any
+
+    @property
+    def is_tick(self) -> bool:
+        return self.topic == TICKS_TOPIC
 
 
 class Thinning:
@@ -205,52 +209,45 @@ class RecordingWriter:
         self._channel_of(TELEMETRY_TOPIC)
         self._begin_ns = self._chunk_ns = 0
 
-    def _rotate(self, folder: RecordingFolder) -> None:
-        """End the file and begin a new one if size or length are over the budget."""
-        if not folder.is_due(self._file.tell(), (self._chunk_ns - self._begin_ns) * 1e-9):
-            return
-        try:
-            path = folder.new()
-        except OSError as error:
-            self._give_up(str(error.strerror), error.errno)
-        self._end()
-        self._begin(path)
-
-    def _give_up(self, reason: str, number: int | None = errno.ENOSPC) -> NoReturn:
-        self.describe({CUT: reason})
-        self._end()
-        raise OSError(number, reason)
-
     def describe(self, metadata: dict[str, str]) -> None:
         """Write metadata, now and into every later file in the folder."""
         self._about |= metadata
         self._mcap.add_metadata(ABOUT, metadata)
 
     def ticks(self, batch: TickBatch) -> None:
-        """Write a batch; of ticks that are thinned, nothing for a replay."""
-        core = batch.core if self._thinning.every == 1 else b""
-        entries = msgspec.msgpack.decode(core, type=list[Any]) if core else [list(row) for row in batch.rows]
-        self.entries(batch.columns, entries, core)
-        if self._folder is not None:
-            self._rotate(self._folder)
+        """Write a batch, and end the file where it is due."""
+        entries = [list(row) for row in batch.rows]
+        if batch.core:
+            entries = msgspec.msgpack.decode(batch.core, type=list[Any])
+        self.entries(batch.columns, entries, batch.core)
+        lasts_s = (self._chunk_ns - self._begin_ns) * 1e-9
+        if self._folder is not None and self._folder.is_due(self._file.tell(), lasts_s):
+            try:
+                path = self._folder.new()
+            except OSError as error:  # what is written is ended in order, whatever the reason
+                raise NoRoomError(error.errno, error.strerror) from error
+            self._end()
+            self._begin(path)
 
     def entries(self, columns: Sequence[str], entries: Sequence[Any], core: bytes) -> None:
-        """Write `core`, which has these entries, and then what is derived of them."""
+        """Write `core`, which has these entries, and then what is derived of them; thinned, nothing for a replay."""
         self._schemas[TICKS_TOPIC] = TICK_SCHEMA if set(columns) <= set(COLUMNS) else OTHER_SCHEMA
         shown = list(self._derived.of(columns, entries))
-        if core:
+        if self._thinning.every > 1:
+            shown = [each for each in shown if each.topic != FRAMES_TOPIC]
+        elif core:
             self._add(Shown(CORE_TOPIC, shown[-1].t_ns if shown else self._chunk_ns, 0, core))
         adds = {TICKS_TOPIC: self._tick, TELEMETRY_TOPIC: self._snapshot, FRAMES_TOPIC: self._add}
         for each in shown:
             adds[each.topic](each)
 
     def _snapshot(self, shown: Shown) -> None:
-        mark = msgspec.convert(shown.message.get("mark"), Mark | None)
-        if mark not in (None, self._mark):  # every snapshot has the newest
-            self._thinning.happened(shown.t_ns)
-            self._mark = mark
         self._add(shown)
         self.telemetry_count += 1
+        mark = msgspec.convert(shown.message.get("mark"), Mark | None)
+        if mark not in (None, self._mark):  # every snapshot has the newest, which may be from before this file
+            self._thinning.happened(shown.t_ns)
+            self._mark = mark
         if self._overview.add(shown.t_ns, False, {"mark": mark}) and self._folder is not None:
             try:
                 self.path = self._folder.mark_around(self.path)
@@ -277,7 +274,8 @@ class RecordingWriter:
     def _end(self) -> None:
         with self._file:
             self._mcap.flush()  # type: ignore[no-untyped-call]
-            self._mcap.add_attachment(0, 0, OVERVIEW, "application/msgpack", self._overview.made().packed())
+            overview = msgspec.msgpack.encode(self._overview.made())
+            self._mcap.add_attachment(0, 0, OVERVIEW, "application/msgpack", overview)
             self._mcap.finish()  # type: ignore[no-untyped-call]
             self._file.flush()
             os.fsync(self._file.fileno())
@@ -288,31 +286,34 @@ class RecordingWriter:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
     ) -> None:
-        if isinstance(error, OSError):
+        if isinstance(error, NoRoomError):
+            self.describe({CUT: str(error.strerror)})
+            self._end()
+        elif isinstance(error, OSError):
             with contextlib.suppress(OSError):  # after a chunk that was cut, an index would make the file unreadable
                 self._file.close()
         else:
             self.close()
 
     def _channel_of(self, topic: str) -> int:
-        schema, schema_id = self._schemas[topic], 0
-        title = schema["title"] if schema else ""
-        if (topic, title) not in self._channels:
+        schema, schema_id, encoding = self._schemas[topic], 0, "msgpack"
+        known = topic, schema["title"] if schema else ""
+        if known not in self._channels:
             if schema:
-                data = msgspec.json.encode(schema)
-                schema_id = self._mcap.register_schema(name=title, encoding="jsonschema", data=data)
-            encoding = "json" if schema else "msgpack"
-            self._channels[topic, title] = self._mcap.register_channel(topic, encoding, schema_id)
-        return self._channels[topic, title]
+                schema_id = self._mcap.register_schema(schema["title"], "jsonschema", msgspec.json.encode(schema))
+                encoding = "json"
+            self._channels[known] = self._mcap.register_channel(topic, encoding, schema_id)
+        return self._channels[known]
 
     def _add(self, shown: Shown) -> None:
         topic, t_ns, sequence, message = shown
         if abs(t_ns - self._chunk_ns) > CHUNK_NS or not self._chunk_ns:
             self._mcap.flush()  # type: ignore[no-untyped-call]
             index_bytes = self._file.tell() // INDEX_SHARE
-            reason = disk_room(self.path, index_bytes) if self._folder is None else self._folder.room(index_bytes)
-            if reason:
-                self._give_up(reason)
+            if self._folder is None:
+                require_room(self.path, index_bytes)
+            else:
+                self._folder.require_room(index_bytes)
             self._file.flush()
             self._begin_ns, self._chunk_ns = self._begin_ns or t_ns, t_ns
         data = message if topic == CORE_TOPIC else msgspec.json.encode(message)

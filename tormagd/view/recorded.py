@@ -12,7 +12,7 @@ import numpy as np
 from tormagd.control.safety.codes import FAULTS, LIMITS
 from tormagd.record.force_following import in_words
 from tormagd.record.overview import BREAK_NS, BREAK_S, QUANTITIES, Floats, codes_in, glance, quantities
-from tormagd.record.reader import RecordingFile, Seen
+from tormagd.record.reader import RecordingFile, Shown
 from tormagd.view.believed import as_said
 from tormagd.view.frame import DRIVEN, SHOWN_S, Frame, Held, late_counts
 from tormagd_client.messages import BeliefReport, Explained, PortraitReport
@@ -40,7 +40,7 @@ Moment = glance(belief=dict[str, dict[str, Any]])
 class Moments:
     """Ticks or snapshots of a recording: times since its start (n), and of ticks the quantities (n, 8)."""
 
-    def __init__(self, seen: Sequence[Seen], start_ns: int) -> None:
+    def __init__(self, seen: Sequence[Shown], start_ns: int) -> None:
         self.messages = [each.message for each in seen]
         self.t_s = np.array([each.t_ns - start_ns for each in seen]) * 1e-9
         # the last row is of no message

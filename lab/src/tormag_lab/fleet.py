@@ -30,7 +30,7 @@ from tormag_lab.told import table
 from tormagd.commission.sequence import MAX_BYTES, Report
 from tormagd.ground.terminal import write_line
 from tormagd.record.overview import Floats, OverviewBuilder, glance
-from tormagd.record.reader import Seen, read_open
+from tormagd.record.reader import Shown, read_open
 from tormagd_client.printable import printable
 
 DAY_S = 86_400.0
@@ -77,8 +77,8 @@ class Summary(msgspec.Struct, frozen=True, kw_only=True):
 def summarise(file: BinaryIO, name: str) -> Summary:
     builder, enabled = OverviewBuilder(), {name: array("d") for name in FIGURES}
 
-    def take(seen: Seen) -> None:
-        builder.add(*seen)
+    def take(seen: Shown) -> None:
+        builder.add(seen.t_ns, seen.is_tick, seen.message)
         if seen.is_tick and seen.message.get("operating_state") in (None, "ENABLED"):
             for name, values in enabled.items():
                 value = seen.message.get(name)

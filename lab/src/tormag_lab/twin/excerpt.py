@@ -13,7 +13,7 @@ import numpy as np
 from tormag_lab.arrays import Array
 from tormag_lab.errors import LabError
 from tormagd.commission.carriage_findings import SIDES, smooth, smoothed
-from tormagd.record.reader import RecordingError, Seen, read_recording
+from tormagd.record.reader import RecordingError, Shown, read_recording
 
 GRID_HZ = 100.0
 "Each row is a mean over its time."
@@ -115,7 +115,7 @@ class Taking:
         self._others: list[tuple[float, float]] = []
         self._moves: dict[str, list[Array]] = {side: [] for side in SIDES}
 
-    def see(self, seen: Seen) -> None:
+    def see(self, seen: Shown) -> None:
         """Take a message, if it is a control tick with a time."""
         if not seen.is_tick or self._refusal or math.isnan(now_s := seen.message.monotonic_s):
             return
