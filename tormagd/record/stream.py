@@ -42,7 +42,7 @@ from tormagd.hardware.measurement import DeviceRequest, Measurement
 from tormagd.scenes.scene import Scene, Terms
 from tormagd_client.messages import VERSION, BeliefReport, Telemetry, Tick
 
-FORMAT = 24
+FORMAT = 25
 "Version of entries, states and times: raised when one comes, goes or changes its meaning. No other is rerun."
 KNOWN = kinds(
     *(SafetyState, OperatingState, DeviceRequest, Fault, Limit, Conditions, DeviceMode, Switches, DeviceFault),
