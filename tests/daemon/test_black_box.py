@@ -5,6 +5,7 @@ import os
 import socket
 import time
 import tracemalloc
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from unittest.mock import Mock, patch
 
@@ -162,6 +163,13 @@ def answered(rig: Rig) -> list[Write]:
     return found
 
 
+def test_a_name_that_a_clock_gives_again_holds_up_no_other(rig: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("time.time_ns", iter([10**9, 10**9, 2 * 10**9]).__next__)
+    for _ in range(3):
+        rig.box.write("REQUEST", 0.0, {})
+        assert [each.reason for each in answered(rig)] == ["REQUEST"]
+
+
 def test_requests_take_no_place_of_a_fault(rig: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("time.time_ns", iter(range(0, 10**12, 10**6)).__next__)
     for number in range(1_000):
@@ -186,6 +194,19 @@ def test_a_fault_s_box_has_what_came_after_it_also_where_the_daemon_ends(rig: Ri
     rig.box.close()
     *asked, end = rig.heard()
     assert ([each.reason for each in asked], end) == (["SKEW", "STALL"], End())
+
+
+def test_an_end_with_more_boxes_due_than_the_socket_holds_loses_none(rig: Rig) -> None:
+    for number in range(20):
+        rig.box.write(f"F{number}", 3_600.0, {"firmware": "x" * 20_000})
+    with ThreadPoolExecutor() as beside:
+        ended = beside.submit(rig.box.close)
+        said: list[Write | End] = []
+        while not ended.done():
+            said += rig.heard()
+    said += rig.heard()
+    assert [each.reason for each in said[:-1]] == [f"F{number}" for number in range(20)]
+    assert said[-1] == End()
 
 
 @pytest.mark.parametrize("is_noticed", [True, False])

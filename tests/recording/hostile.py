@@ -10,7 +10,17 @@ import msgpack
 import zstandard
 from mcap.data_stream import RecordBuilder
 from mcap.opcode import Opcode
-from mcap.records import Attachment, AttachmentIndex, Channel, Chunk, ChunkIndex, Footer, Schema
+from mcap.records import (
+    Attachment,
+    AttachmentIndex,
+    Channel,
+    Chunk,
+    ChunkIndex,
+    Footer,
+    Metadata,
+    MetadataIndex,
+    Schema,
+)  # fmt: skip
 from mcap.writer import MCAP0_MAGIC as MAGIC, Writer
 
 from tormagd.record.writer import OVERVIEW
@@ -106,6 +116,15 @@ FILES: dict[str, Callable[[], bytes]] = {
         + record(Chunk("zstd", zstandard.compress(s := record(Schema(1, bytes(7_000_000), "", ""))), 1, 1, 0, len(s))),
         *[ChunkIndex(9, 8 + len(CHANNEL), "", 1, 9, 0, {}, 0, 9)] * 1_000,
     ),
+    "an index that names the same metadata fifty times": lambda: ended(
+        record(told := Metadata("tormagd", {"scene": "x" * 7_000_000})),
+        *[MetadataIndex(8, len(record(told)), "tormagd")] * 50,
+    ),
+    "a summary of 30 MB": lambda: ended(
+        CHANNEL, *[ChunkIndex(9, 8, "", 1, 9, 0, {n: 2**40 + n for n in range(65_000)}, 0, 9)] * 46
+    ),
+    "magic alone": lambda: MAGIC + MAGIC,
+    "a footer without a summary": lambda: ended(CHANNEL, at=0),
     "an overview of rubbish": lambda: ended(
         record(Attachment(0, 0, OVERVIEW, "x", b"\xdd\xff\xff\xff\xff" * 1_000)),
         AttachmentIndex(8, 9, 0, 0, 1, OVERVIEW, "x"),

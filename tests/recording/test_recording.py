@@ -142,6 +142,15 @@ def test_before_a_disk_is_full_all_that_came_is_closed_in_order(tmp_path, monkey
     assert (writer.tick_count + 400) // 500 == chunks
 
 
+def test_a_disk_that_is_full_at_the_end_costs_a_thinned_recording_what_waited(tmp_path, monkeypatch):
+    writer = RecordingWriter(tmp_path / "full.mcap", every=2)
+    writer.ticks(batch(*((ms, 1.0, 1.0, 35.0, 35.0, 0.0) for ms in range(3_000))))
+    monkeypatch.setattr(shutil, "disk_usage", lambda path: SimpleNamespace(free=0))
+    with pytest.raises(OSError, match="No space left on device"):
+        writer.close()
+    assert RecordingFile(writer.path).notes[0] == "cut short: No space left on device: 0.0 MB are free, needed are 16.0"
+
+
 def test_half_a_second_is_written_at_once(tmp_path):
     path = tmp_path / "a.mcap"
     writer = RecordingWriter(path)
@@ -387,6 +396,7 @@ def test_a_thinned_recording_has_all_around_a_fault_and_a_mark_and_says_so(tmp_p
     assert np.array_equal(at_ms[at_ms >= 5_020], np.arange(5_020, 30_000))
     assert len(at_ms[at_ms < 5_020]) == pytest.approx(100, abs=2)
     assert RecordingFile(path).overview.ticks == 30_000
+    assert len(chunks_in(path)) < 2 * 30 + 10
 
 
 @pytest.mark.parametrize("made_ms", [-10, 10])

@@ -90,7 +90,7 @@ class BlackBox:
         self._ring: Ring | None = None
         self._due_s, self.is_heard = 0.0, False
         self._unwritten: dict[str, tuple[float, Write]] = {}
-        "By name, and when it is due. A new keeper is asked for all of it."
+        "By name, and when due. A new keeper is asked for all of it."
         self._asked = ""
         "The name in the newest request."
         if folder is None:
@@ -180,7 +180,7 @@ class BlackBox:
                 self._refusal = self._asked = ""
         while self._beside is not None and (data := self._beside.receive()) is not None:
             answer = msgspec.msgpack.decode(data, type=Written)
-            self._refusal = answer.refusal
+            self._refusal, self._asked = answer.refusal, ""
             self._unwritten.pop(answer.name, None)
             if answer.refusal:
                 log.error("the black box %s was not written: %s", answer.name, answer.refusal)
@@ -209,9 +209,11 @@ class BlackBox:
         if self._ring is not None:
             self._ring.path.unlink(missing_ok=True)
         if (beside := self._beside) is not None:
-            for _, asked in self._unwritten.values():
-                beside.send(msgspec.msgpack.encode(asked))
-            beside.send(msgspec.msgpack.encode(End()))
+            beside.socket.settimeout(LEAVING_S)  # it holds a dozen requests
+            all(
+                beside.send(msgspec.msgpack.encode(each))
+                for each in (*(asked for _, asked in self._unwritten.values()), End())
+            )
             beside.close()
             with contextlib.suppress(subprocess.TimeoutExpired):
                 beside.process.wait(LEAVING_S)

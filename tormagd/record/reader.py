@@ -17,9 +17,10 @@ from typing import Any, BinaryIO, NamedTuple
 
 import msgspec
 from mcap.exceptions import McapError
-from mcap.reader import FOOTER_SIZE, SeekingReader
+from mcap.reader import FOOTER_SIZE
 from mcap.records import (
     Attachment,
+    AttachmentIndex,
     Channel,
     Chunk,
     ChunkIndex,
@@ -28,6 +29,7 @@ from mcap.records import (
     McapRecord,
     Message,
     Metadata,
+    MetadataIndex,
 )  # fmt: skip
 from mcap.stream_reader import MAGIC_SIZE, StreamReader, breakup_chunk
 from mcap.writer import MCAP0_MAGIC
@@ -58,8 +60,8 @@ MAX_RATIO, FREE_BYTES = 100, 16_000_000
 MAX_WINDOW_BYTES = 1 << 24
 DATA_END_BYTES = 13
 BLOCK_BYTES = 1 << 20
-MAX_SUMMARY_BYTES = 64_000_000
-"The chunks of two days."
+MAX_INDEX = 1_000_000
+"Chunks of one file: some days."
 MAX_SEEN = 400_000
 "Messages read at once: at 4 kHz more than a minute."
 END_NS = 2**64 - 1
@@ -93,23 +95,23 @@ def readable(name: str) -> Iterator[None]:
     try:
         yield
     except UNREADABLE as error:
-        raise RecordingError(f"{name}: not an intact MCAP file of tormagd ({str(error)[:200]})") from error
+        raise RecordingError(
+            str(error)
+            if isinstance(error, RecordingError)
+            else f"{name}: not an intact MCAP file of tormagd ({str(error)[:200]})"
+        ) from error
 
 
 class _Bounded:
-    """A file for an MCAP reader, which may read `most` bytes of one place, and `left` more."""
+    """A file for an MCAP reader, which may read `left` more bytes."""
 
-    def __init__(self, file: BinaryIO, most: int = MAX_RECORD_BYTES) -> None:
-        self._file, self._most, self.left = file, most, most
-
-    def seek(self, at: int, whence: int = 0) -> int:
-        self.left = self._most
-        return self._file.seek(at, whence)
+    def __init__(self, file: BinaryIO) -> None:
+        self._file, self.left = file, MAX_RECORD_BYTES
 
     def read(self, size: int) -> bytes:
         self.left -= size
         if self.left < 0:
-            raise ValueError(f"records of over {self._most} bytes")
+            raise ValueError(f"a record of over {MAX_RECORD_BYTES} bytes")
         data = self._file.read(size)
         if len(data) < size:
             raise EOFError("it ends within a record")
@@ -149,22 +151,23 @@ def _at(file: BinaryIO, at: int, kind: type[Any]) -> Any:
     return record
 
 
-def _is_ended(file: BinaryIO) -> bool:
-    file.seek(max(0, file.seek(0, 2) - MAGIC_SIZE))
-    return file.read() == MCAP0_MAGIC
+def _end(file: BinaryIO) -> tuple[int, int]:
+    """Return where summary, 0 for none, and footer begin."""
+    at = max(0, file.seek(0, 2) - FOOTER_SIZE - MAGIC_SIZE)
+    file.seek(at)
+    return _at(file, at, Footer).summary_start if file.read().endswith(MCAP0_MAGIC) else 0, at
 
 
 def damage_in(file: BinaryIO) -> str:
     """Say which CRC of a closed MCAP file is wrong; empty for none, and for a file cut short."""
     try:
-        if not _is_ended(file):
+        summary_at, at = _end(file)
+        if not summary_at:
             return ""
-        at = max(0, file.seek(0, 2) - FOOTER_SIZE - MAGIC_SIZE)
-        footer = _at(file, at, Footer)
-        data_end_at = footer.summary_start - DATA_END_BYTES
+        data_end_at = summary_at - DATA_END_BYTES
         if _at(file, data_end_at, DataEnd).data_section_crc not in (0, _crc(file, 0, data_end_at)):
             return "the CRC of its data is wrong"
-        if footer.summary_crc not in (0, _crc(file, footer.summary_start, at + FOOTER_SIZE - 4)):
+        if _at(file, at, Footer).summary_crc not in (0, _crc(file, summary_at, at + FOOTER_SIZE - 4)):
             return "the CRC of its summary is wrong"
     except UNREADABLE as error:
         return str(error)[:200] or repr(error)
@@ -206,15 +209,20 @@ class Contents:
 
     def _read_summary(self, file: BinaryIO) -> bool:
         """Read what stands at the end, and return whether all of that is there."""
-        with contextlib.suppress(*UNREADABLE):
-            reader = SeekingReader(_Bounded(file, MAX_SUMMARY_BYTES), record_size_limit=MAX_RECORD_BYTES)  # type: ignore[arg-type]
-            summary = reader.get_summary()
-            if summary is None or not _is_ended(file):
-                return False
-            for record in (*summary.channels.values(), *reader.iter_metadata(), *summary.chunk_indexes):
+        told: list[int] = []
+        with contextlib.suppress(*UNREADABLE, OSError):
+            at, _ = _end(file)
+            file.seek(at)
+            for record in _records(file) if at else ():
                 self._take(record, 0)
-            self._overview_at = next((each.offset for each in summary.attachment_indexes if each.name == OVERVIEW), 0)
-            return True
+                if isinstance(record, MetadataIndex):
+                    told.append(record.offset)
+                elif isinstance(record, AttachmentIndex) and record.name == OVERVIEW:
+                    self._overview_at = record.offset
+            for each in told:
+                self._take(_at(file, each, Metadata), each)
+            return at > 0
+        self.places = []
         return False
 
     def _look_for_chunks(self, file: BinaryIO) -> None:
@@ -235,7 +243,7 @@ class Contents:
             self.topics[record.id] = record.topic
         elif isinstance(record, Metadata):
             self.metadata.update(record.metadata)
-        elif isinstance(record, Chunk | ChunkIndex):
+        elif isinstance(record, Chunk | ChunkIndex) and len(self.places) < MAX_INDEX:
             at = record.chunk_start_offset if isinstance(record, ChunkIndex) else at
             self.places.append(Place(record.message_start_time, record.message_end_time, at))
 

@@ -267,8 +267,12 @@ class RecordingWriter:
 
     def close(self) -> None:
         if not self._file.closed:
-            for kept in self._thinning.until():
-                self._add(kept)
+            try:
+                for kept in self._thinning.until():
+                    self._add(kept)
+            except NoRoomError as error:
+                self.__exit__(type(error), error, None)
+                raise
             self._end()
 
     def _end(self) -> None:
@@ -307,7 +311,8 @@ class RecordingWriter:
 
     def _add(self, shown: Shown) -> None:
         topic, t_ns, sequence, message = shown
-        if abs(t_ns - self._chunk_ns) > CHUNK_NS or not self._chunk_ns:
+        # ticks that waited come after newer snapshots
+        if not -2 * AROUND_NS <= t_ns - self._chunk_ns <= CHUNK_NS:
             self._mcap.flush()  # type: ignore[no-untyped-call]
             index_bytes = self._file.tell() // INDEX_SHARE
             if self._folder is None:
