@@ -58,7 +58,7 @@ class SensorTrust:
     share: float = 0.0
     "Share of the anchor to which the fit may fall; 0 until the device has slid."
     below_s: float = 0.0
-    "How long readings have been below the anchor, 2 LEARNS_S at most; falls while they are not."
+    "How long readings have been below the anchor where it is known; falls while they are not."
     low_s: float = 0.0
     "How long they have been below that share."
     outside_s: float = 0.0
@@ -101,7 +101,6 @@ class SensorTrust:
         self.rate_mm_s = self.rate_mm_s if self.has_slid else rate_mm_s
         force_N, deviation_N = max(self.anchor.force_N(model_N), 0.0), self.anchor.deviation_N(model_N)
         self.off_N = low_pass(self.off_N, reading_N - force_N, dt_s, FILTER_S)
-        self.below_s = within(self.below_s + (dt_s if self.off_N < 0.0 else -dt_s), (0.0, 2.0 * LEARNS_S))
         unsure_N = SLACK_N + SURE * max(zero_sd_N - UNKNOWN_SD_N, 0.0)
         least_N = self._trim.least * (1.0 - WEAKENED) * model_N - unsure_N
         most_N = self._trim.most * (1.0 + WEAKENED) * model_N + unsure_N
@@ -131,15 +130,19 @@ class SensorTrust:
         dt_s: float,
     ) -> None:
         """Teach the anchor, which gives `force_N` there, a force at which it is not known; else learn `fallen`."""
-        # where it is half known, readings that stay below it are of a fading sensor or device
+        if deviation_N <= KNOWN_N:
+            self.below_s = within(self.below_s + (dt_s if self.off_N < 0.0 else -dt_s), (0.0, 2.0 * LEARNS_S))
+        # what has fallen where it is known teaches nothing where it is half known
         if deviation_N <= (2.0 * KNOWN_N if self.below_s > LEARNS_S else KNOWN_N):
             self.fallen = within(believed, (self._trim.least, 1.0))
-            return
-        self.rate_mm_s = low_pass(self.rate_mm_s, rate_mm_s, dt_s, LEARNS_S)
-        if self.has_slid:
-            # what has fallen at the forces that are known has fallen here, too
-            reading_N = within(reading_N / self.fallen, (force_N - SURE * deviation_N, force_N + SURE * deviation_N))
-        self.anchor.learn(model_N, reading_N, dt_s)
+        else:
+            self.rate_mm_s = low_pass(self.rate_mm_s, rate_mm_s, dt_s, LEARNS_S)
+            if self.has_slid:
+                # what has fallen at the forces that are known has fallen here, too
+                reading_N = within(
+                    reading_N / self.fallen, (force_N - SURE * deviation_N, force_N + SURE * deviation_N)
+                )
+            self.anchor.learn(model_N, reading_N, dt_s)
 
     def _give_way(self, believed: float, force_N: float, dt_s: float) -> None:
         """Move the `share` that the fit may fall to, beside the share of the anchor's `force_N` that is `believed`."""
