@@ -105,19 +105,19 @@ class SensorTrust:
         least_N = self._trim.least * (1.0 - WEAKENED) * model_N - unsure_N
         most_N = self._trim.most * (1.0 + WEAKENED) * model_N + unsure_N
         is_strange = is_frozen or not least_N <= force_N + self.off_N <= most_N
-        surely_N = SURE * (max(deviation_N - 2.0 * KNOWN_N, 0.0) + VISCOUS_N_S_MM * abs(rate_mm_s - self.rate_mm_s))
+        surely_N = SURE * max(deviation_N - 2.0 * KNOWN_N, 0.0)
+        unsure_N += SURE * VISCOUS_N_S_MM * abs(rate_mm_s - self.rate_mm_s)
         beyond_N = abs(self.off_N) - self._trim.leash * force_N - unsure_N - KNOWN_N - surely_N
         teaches = self._judge(is_strange, beyond_N <= 0.0, is_stale, dt_s)
         leapt_N = (1.0 - LEAPT) * force_N - unsure_N - surely_N if self.has_slid else least_N
         if not (teaches and max(least_N, leapt_N) <= reading_N <= most_N):
             return None
-        taught_N = max(reading_N, self.share * force_N - unsure_N)
         believed = fit.force_N(model_N) / max(force_N, SLACK_N)
         if learns and beyond_N <= 0.0:
             self._learn(model_N, rate_mm_s, force_N, deviation_N, believed, reading_N, dt_s)
         if self.has_slid:
             self._give_way(believed, force_N, dt_s)
-        return taught_N
+        return max(reading_N, self.share * force_N - unsure_N)
 
     def _learn(
         self,
