@@ -344,8 +344,7 @@ ENDS = Portrait([90.0, 50.0], [1.0, 2.0], [0.025, 0.025])
 @pytest.mark.parametrize(("asked_N", "ahead_N", "end_mm"), [(1.01, 1.0, 90.0), (1.99, 2.0, 50.0)])
 def test_no_carriages_are_sent_past_the_ends(asked_N: float, ahead_N: float, end_mm: float) -> None:
     following = governor(0.0, asked_N, portrait=ENDS)
-    preview = TimedSetpoint(asked_N, 1.0, VALID_S, preview_N=(ahead_N,) * 200, preview_dt_s=5e-3)
-    decide(following, 1.0, preview)
+    decide(following, 1.0, TimedSetpoint(asked_N, 1.0, VALID_S, preview_N=(ahead_N,) * 200, preview_dt_s=5e-3))
     assert following.sent_mm == end_mm
 
 

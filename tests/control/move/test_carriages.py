@@ -30,8 +30,7 @@ def test_a_plans_gap_is_carried_forward_along_its_speed_but_not_for_long(running
     running.step(running.plan(80.0, gap_speed_mm_s=-10.0), count=60)
     # the reference closes in on where the plan leads in CARRY_S with the plan's own speed, which the closing speed
     # makes up for APPROACH_S away
-    lag_s = EXCHANGE_S + electrical_time_s(CONFIG.motor)
-    led_mm = 80.0 - 10.0 * (CARRY_S + lag_s)
+    led_mm = 80.0 - 10.0 * (CARRY_S + EXCHANGE_S + electrical_time_s(CONFIG.motor))
     assert running.move.reference.gap_mm == pytest.approx(led_mm - 10.0 * APPROACH_S, abs=0.02)
 
 

@@ -171,7 +171,7 @@ class Believe:
     def _anchor_N(self, factor: float) -> float:
         """Return the model's force, N, of the ceiling on the anchor."""
         anchor, most_N = self.sensor.anchor, self._surely_N
-        most_N += SURE * max(anchor.deviation_N(most_N) - 2.0 * KNOWN_N, 0.0)
+        most_N += SURE * max(anchor.deviation_N(anchor.model_N(most_N)) - 2.0 * KNOWN_N, 0.0)
         return anchor.model_N(most_N / factor) + self.memory.relaxed_N
 
     def _ripple(self, measured: Measured) -> float:

@@ -132,8 +132,8 @@ class SensorTrust:
         """Teach the anchor, which gives `force_N` there, a force at which it is not known; else learn `fallen`."""
         if deviation_N <= KNOWN_N:
             self.below_s = within(self.below_s + (dt_s if self.off_N < 0.0 else -dt_s), (0.0, 2.0 * LEARNS_S))
-        # what has fallen where it is known teaches nothing where it is half known
-        if deviation_N <= (2.0 * KNOWN_N if self.below_s > LEARNS_S else KNOWN_N):
+        # a fall where it is known teaches nothing lower where it is half known
+        if deviation_N <= (2.0 * KNOWN_N if self.below_s > LEARNS_S and self.off_N < 0.0 else KNOWN_N):
             self.fallen = within(believed, (self._trim.least, 1.0))
         else:
             self.rate_mm_s = low_pass(self.rate_mm_s, rate_mm_s, dt_s, LEARNS_S)
