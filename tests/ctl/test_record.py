@@ -91,8 +91,7 @@ def test_a_folder_of_recordings_is_listed_pruned_marked_and_exported(fake_daemon
     made = ctl(*command, "record", str(folder), "--duration", "1.5").ended(0).result
     listed = ctl(*command, "recordings", "list").ended(0).result
     names = [row["name"] for row in listed["recordings"]]
-    assert len(names) > 1
-    assert names[-1] == Path(made["file"]).name
+    assert (len(names) > 1, names[-1]) == (True, Path(made["file"]).name)
     assert re.fullmatch(r"\d{4}-\d\d-\d\dT\d\d-\d\d-\d\d\.\d{3}Z\.mcap", names[-1])
     assert {row["is_marked"] for row in listed["recordings"]} == {False}
     kept = ctl(*command, "recordings", "mark", str(folder / names[-1])).ended(0).result["file"]
@@ -108,7 +107,8 @@ def test_a_folder_of_recordings_is_listed_pruned_marked_and_exported(fake_daemon
     assert ctl(*command, "recordings", "prune").ended(0).result["removed"] == names[:-1]
     assert [path.name for path in folder.iterdir()] == [Path(kept).name]
     gone = f"/no/{Path(kept).name}"
-    for wrong in ("list /no", "mark", f"mark {gone}", f"mark {config}", f"export {kept}", f"export {gone} --to /"):
+    no_exports = f"export {kept}", f"export {gone} --to /", f"export /dev/zero --to {tmp_path}/zero"
+    for wrong in ("list /no", "mark", f"mark {gone}", f"mark {config}", *no_exports):
         assert ctl(*command, "recordings", *wrong.split()).ended(2).error["hint"]
 
 

@@ -43,6 +43,7 @@ from tormagd_client.endpoints import ConfigError, Endpoints
 from tormagd_client.errors import ClientError, unreachable
 from tormagd_client.messages import MessageError
 from tormagd_client.printable import printable
+from tormagd_client.regular_file import require_regular
 from tormagd_client.wire import connect, keys_of
 
 QUEUE = 10_000
@@ -233,14 +234,14 @@ def _export(path: Path, target: Path | None) -> Outcome:
     if target is None:
         raise usage_error("export: no place is named", f"tormagctl recordings export {path} --to FOLDER")
     copy = target / path.name if target.is_dir() else target
+    require_regular(path)
     with new_file(copy):
         shutil.copyfile(path, copy)
     with copy.open("rb") as made:
         digest = hashlib.file_digest(made, "sha256").hexdigest()
         damage = damage_in(made)
     text = "\n".join([f"{copy}: SHA-256 {digest}", *([f"damaged: {damage}"] if damage else [])])
-    result = {"file": str(copy), "sha256": digest, "damage": damage}
-    return Outcome(result, text, Exit.REFUSED if damage else Exit.DONE)
+    return Outcome({"file": str(copy), "sha256": digest, "damage": damage}, text, Exit.REFUSED if damage else Exit.DONE)
 
 
 def replay(
@@ -279,8 +280,7 @@ def _again(path: Path, from_s: float) -> dict[str, Any]:
 def _rehearsed(path: Path, arguments: list[str]) -> dict[str, Any]:
     with as_usage_error(TimeoutError, ChildProcessError, hint=REPLAYED):
         answer = answer_of("tormagd.simulation.rehearse", [*arguments, "--", str(path)], LONGEST_REHEARSAL_S)
-    result: dict[str, Any] = json.loads(answer)  # names in it need not be UTF-8
-    return result
+    return dict(json.loads(answer))  # names in it need not be UTF-8
 
 
 def _rerun(done: dict[str, Any]) -> str:

@@ -261,7 +261,7 @@ class Contents:
                 chunk = _at(file, place.at, Chunk)
                 size += max(min(chunk.uncompressed_size, MAX_RECORD_BYTES), len(chunk.data))
                 records = _within(chunk)
-            except UNREADABLE as error:
+            except (*UNREADABLE, OSError) as error:
                 self.lost[place.at] = f"byte {place.at}: {str(error)[:80] or repr(error)}"
                 continue
             for record in records:
