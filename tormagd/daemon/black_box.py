@@ -35,7 +35,7 @@ from tormagd.record.keeper import (
     box_path,
     in_shared_memory,
 )
-from tormagd.record.stream import COLUMNS, FORMAT, MISSING, STATE, Journal, Moment, core_hash, packed
+from tormagd.record.stream import COLUMNS, FORMAT, MISSING, STATE, Journal, Moment, TickRecord, core_hash, packed
 from tormagd_client.messages import BlackBoxReport
 
 KEEPER = "tormagd.record.keeper"
@@ -117,7 +117,7 @@ class BlackBox:
         self._begin_anew(stepper, planner)
 
     def ticked(self, moment: Moment, stepper: Stepper, planner: Planner) -> tuple[bytes, list[Any]] | None:
-        """Add a tick to the journal; when there are PART_TICKS, return all entries and the ticks, encoded."""
+        """Add a tick to the journal; when there are PART_TICKS, return all entries, encoded, and the ticks."""
         was_kept, self.journal.is_kept = self.journal.is_kept, self._ring is not None or self.is_heard
         if not (was_kept and self.journal.is_kept):  # from the end of this period
             self._ticks = 0
@@ -125,11 +125,11 @@ class BlackBox:
             return None
         part: tuple[bytes, list[Any]] | None = None
         try:
-            self.journal.add(msgspec.Raw(packed(moment.row())))
+            self.journal.add(moment)
             self._ticks += 1
             if self._ticks % PART_TICKS == 0:
                 entries = self.journal.take()
-                part = packed(entries), [each for each in entries if isinstance(each, msgspec.Raw)]
+                part = packed(entries), [each for each in entries if isinstance(each, TickRecord)]
                 if self._ring is not None:
                     self._ring.put(self.header, Part(moment.time_s, part[0]))
         except (TypeError, ValueError, OverflowError, OSError) as error:  # control goes on, whatever is in it

@@ -56,7 +56,6 @@ MAX_FILE_BYTES = 1 << 40
 MAX_RECORD_BYTES = 8_000_000
 "A black box's largest message has half of this."
 MAX_RATIO, FREE_BYTES = 100, 16_000_000
-"All chunks unpack to at most MAX_RATIO times the bytes read, plus FREE_BYTES."
 MAX_WINDOW_BYTES = 1 << 24
 DATA_END_BYTES = 13
 BLOCK_BYTES = 1 << 20

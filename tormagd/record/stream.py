@@ -83,9 +83,9 @@ class Journal:
         self.add((name, *what))
 
     def take(self) -> list[Any]:
-        """Return and remove all entries."""
+        """Return and remove all entries, ticks as rows: a row after others takes a quarter."""
         entries, self._entries = self._entries, []
-        return entries
+        return [each.row() if isinstance(each, Moment) else each for each in entries]
 
     def add(self, entry: Any) -> None:
         if not self.is_kept:
