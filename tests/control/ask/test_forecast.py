@@ -131,8 +131,7 @@ def ramps_N(times_s: Array) -> Array:
 
 def wander_N(times_s: Array) -> Array:
     white = np.random.default_rng(5).normal(size=(40, 2))
-    frequencies = np.random.default_rng(6).uniform(0.2, 4.0, 40)
-    phases = 2.0 * math.pi * np.outer(times_s, frequencies)
+    phases = 2.0 * math.pi * np.outer(times_s, np.random.default_rng(6).uniform(0.2, 4.0, 40))
     return 1.4 + 0.03 * (np.cos(phases) @ white[:, 0] + np.sin(phases) @ white[:, 1])
 
 

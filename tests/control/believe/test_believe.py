@@ -5,7 +5,7 @@ import math
 import msgspec
 import pytest
 
-from tormagd.control.believe.believe import NOTHING_LEARNED, UNTARED_N, Learned
+from tormagd.control.believe.believe import AHEAD_S, NOTHING_LEARNED, UNTARED_N, Learned
 from tormagd.control.believe.carriage_lag import AGE_S, MAX_LAG_S
 from tormagd.control.believe.handle import BRISTLES_N_MM
 from tormagd.control.believe.sensor_zero import MAX_SD_N, UNKNOWN_SD_N
@@ -51,11 +51,17 @@ def test_a_force_is_a_pull_only_where_the_sensors_zero_is_known(planner, planned
     assert planner.way.travel.is_pushing is not is_known
 
 
+def test_a_ripple_is_asked_for_where_the_handle_will_be(core, hear, moving) -> None:
+    believe = hear(core.planner(), 2.0, moving()).believe
+    believe.ripple.shares = [0.1 * math.sin(0.1 * place) for place in range(len(believe.ripple.shares))]
+    belief, there_mm = believe.update(2.0, moving()), moving().handle_mm + 42.0 * AHEAD_S
+    assert belief.device.scale / belief.at_speed.scale == pytest.approx(1.0 + believe.ripple.share(there_mm / 20.0))
+
+
 @pytest.mark.parametrize("static", [0.95, 1.12])
 def test_a_reading_just_above_a_creep_teaches_the_force_there(planner, hear, moving, static: float) -> None:
     planner.believe.teach(Learned(slow_factor=static, slow_learned=1.0))
-    slow = {"handle": Handle(MOBILISED_MM, 6.0, TURN, 6.0)}
-    plan = hear(planner, 8.0, moving(force_N=0.9 * 1.0871, **slow)).planned
+    plan = hear(planner, 8.0, moving(force_N=0.9 * 1.0871, handle=Handle(MOBILISED_MM, 6.0, TURN, 6.0))).planned
     assert plan.predicted_N == pytest.approx(0.9 * 1.0871, abs=6e-3)
 
 
@@ -108,8 +114,7 @@ def test_a_creep_is_a_handle_that_is_slow_and_has_been(
 def test_before_it_is_mobilised_only_more_force_than_expected_teaches(
     planner, hear, moving, force_N: float, teaches: bool
 ) -> None:
-    handle = Handle(MOBILISED_MM - 0.01, 1.0, TURN, 1.0)
-    slow = hear(planner, 0.2, moving(force_N=force_N, handle=handle)).believe.slow
+    slow = hear(planner, 0.2, moving(force_N=force_N, handle=Handle(MOBILISED_MM - 0.01, 1.0, TURN, 1.0))).believe.slow
     assert (slow.learned > 0.0, slow.factor > 1.0) == (teaches, teaches)
 
 

@@ -68,8 +68,7 @@ def test_what_is_believed_of_a_creep_grows_by_three_deviations_of_the_fit() -> N
 @pytest.mark.parametrize("rate_mm_s", [0.5, 2.0, 4.0])
 def test_beside_a_fit_that_learned_the_force_at_a_creep_stays(rate_mm_s: float) -> None:
     slow = crept(1.05, 9.0, rate_mm_s)
-    after = rescaled(slow, 1.0, 1.05)
-    assert after.factor_at(rate_mm_s) * 1.05 == pytest.approx(slow.factor_at(rate_mm_s), rel=1e-3)
+    assert rescaled(slow, 1.0, 1.05).factor_at(rate_mm_s) * 1.05 == pytest.approx(slow.factor_at(rate_mm_s), rel=1e-3)
     # a fit that learned there shows what the force at a creep is
     assert rescaled(slow, 1.0, 1.05, rate_mm_s).factor == pytest.approx(slow.factor)
 

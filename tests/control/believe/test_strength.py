@@ -80,8 +80,7 @@ STRONGEST = 1.53
 def test_what_is_surely_within_is_within(levels: list[tuple[float, float]], scale: float) -> None:
     most_N = 2.5
     model_N = shown(levels, scale, 0.0).surely_within_N(most_N, BOUNDS)
-    allowed_N = most_N if levels else most_N * STRONGEST / (1.0 + SURE * SCALE_SD)
-    assert scale * model_N <= 1.03 * allowed_N
+    assert scale * model_N <= 1.03 * most_N * (1.0 if levels else STRONGEST / (1.0 + SURE * SCALE_SD))
     assert most_N / BOUNDS.most <= model_N <= most_N / BOUNDS.least
 
 

@@ -34,7 +34,6 @@ class Ripple:
     """Estimator of the friction's share over the handle's angle."""
 
     place: int = 0
-    "Where the handle is."
     total: float = 0.0
     "Sum of the readings there, over the anchor, the known ripple put on."
     readings: int = 0
@@ -46,13 +45,12 @@ class Ripple:
     force_N: float = math.inf
     "The anchor's force as the handle left it."
     rate_mm_s: float = 0.0
-    "And its rate."
     passes: int = -SETTLES
-    "How many passes one after the other have taught; less than 0 while something settles."
+    "Passes in a row that taught; less than 0 while something settles."
 
     def __init__(self) -> None:
         self.shares = [0.0] * PLACES
-        """At each place, by which share friction is greater than its mean, as far as that is trusted."""
+        """At each place, as far as it is trusted."""
         self.slopes = [0.0] * PLACES
         self.before = [0.0] * PLACES
         """What the newest pass of each place had left to teach."""
