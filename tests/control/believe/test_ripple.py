@@ -45,17 +45,21 @@ def test_turns_teach_once_twice_and_three_times_a_turn(shape: Shape, turn: dict[
     ids=["fades", "leaps"],
 )
 def test_what_does_not_come_again_at_the_same_angle_is_no_ripple(shape: Shape) -> None:
-    ripple = turned(shape, 5.2)
-    assert [ripple.share(angle) for angle in range(7)] == pytest.approx([0.0] * 7, abs=1e-3)
+    assert list(map(turned(shape, 5.2).share, range(7))) == pytest.approx([0.0] * 7, abs=1e-3)
 
 
-@pytest.mark.parametrize("stroke_rad", [2.0, 10.0])
-def test_a_fade_is_no_ripple_though_the_handle_turns_back(stroke_rad: float) -> None:
+@pytest.mark.parametrize(
+    ("stroke_rad", "fades_N", "swing_N"), [(2.0, 1e-4, 0.0), (10.0, 1e-4, 0.0), (math.inf, 0.0, 0.3)]
+)
+def test_neither_a_fade_nor_what_lags_behind_a_swing_is_a_ripple(
+    stroke_rad: float, fades_N: float, swing_N: float
+) -> None:
     ripple, angle = Ripple(), 0.2
     for step in range(6000):
         way = 1.0 if (step * STEP_RAD) // stroke_rad % 2 == 0 else -1.0
         angle += STEP_RAD * way
-        ripple.update(angle, 42.0 * way, 1.5, 1.5 - 1e-4 * step)
+        force_N, lags_N = 1.5 + swing_N * math.sin(3.0 * angle), 0.15 * swing_N * math.cos(3.0 * angle)
+        ripple.update(angle, 42.0 * way, force_N, (force_N - lags_N - fades_N * step) / (1.0 + ripple.share(angle)))
     assert [ripple.share(angle) for angle in range(7)] == pytest.approx([0.0] * 7, abs=0.01)
 
 

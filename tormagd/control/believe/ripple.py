@@ -19,8 +19,8 @@ QUIET: Final = 0.015
 "A ripple that nowhere exceeds this is none: noise and relaxing leave as much."
 PLACES: Final = 36
 "Waves of up to three a turn are cut by 4 % at most."
-STEEPEST: Final = 0.12
-"No ripple changes by a greater share from place to place, nor moves the gap by as much."
+STEEPEST: Final = 0.08
+"Three waves of 15 % change no faster from place to place, nor does the gap."
 HEARD: Final = 12
 "Fewer readings at a place leave noise that looks like a ripple: three at 300 mm/s, ten at 100."
 SETTLES: Final = 3
