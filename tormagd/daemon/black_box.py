@@ -1,8 +1,7 @@
 """The stream: all inputs of the core, and all traffic with the device, for the black box and for recorders.
 
-The control thread writes references and encoded ticks into a journal, and hands on PART_TICKS at once: to recorders by
-ZeroMQ, and into a ring in shared memory. Another process writes the ring to files, and outlives the daemon, however the
-daemon ends.
+The control thread writes references into a journal, and hands on PART_TICKS at once: to recorders by ZeroMQ, and into
+a ring in shared memory. Another process writes the ring to files, and outlives the daemon, however the daemon ends.
 """
 
 import contextlib
