@@ -125,6 +125,7 @@ FILES: dict[str, Callable[[], bytes]] = {
     ),
     "magic alone": lambda: MAGIC + MAGIC,
     "a footer without a summary": lambda: ended(CHANNEL, at=0),
+    "a summary beyond all": lambda: ended(CHANNEL, at=2**63 - 1),
     "an overview of rubbish": lambda: ended(
         record(Attachment(0, 0, OVERVIEW, "x", b"\xdd\xff\xff\xff\xff" * 1_000)),
         AttachmentIndex(8, 9, 0, 0, 1, OVERVIEW, "x"),

@@ -11,7 +11,7 @@ READABLE = {
     "a small message of brackets", "a schema of brackets", "metadata of brackets", "ever new columns",
     "a million columns at once", "a time beyond all", "a summary that is the file", "a chunk within a chunk",
     "70,000 schemas in a chunk", "a message without a chunk, too short", "a footer without a summary",
-    "an index that names the same metadata fifty times", "a summary of 30 MB",
+    "an index that names the same metadata fifty times", "a summary of 30 MB", "a summary beyond all",
 }  # fmt: skip
 MAX_MB = 200
 READ = """
@@ -42,9 +42,7 @@ def test_hostile_files_are_refused_in_a_sentence_within_200_MB(tmp_path: Path) -
     assert [each for look, each in said.items() if look.split(" ", 1)[1] not in each or "\n" in each] == []
     assert max(map(len, said.values())) <= 400
     assert [each for look, each in said.items() if each.count(look.split(" ", 1)[1]) > 1] == []
-    assert {files[look.split(" ", 1)[1]] for look, each in said.items() if "Invalid argument" in each} <= {
-        "a summary that is the file"
-    }
+    assert [each for each in said.values() if "Invalid argument" in each] == []
     bomb = next(path for path, name in files.items() if name.startswith("a thousand damaged"))
     assert "unpacks to over" in said[f"read_recording {bomb}"]
     # at a glance, before all of it is read

@@ -68,10 +68,10 @@ MAX_CORE_BYTES, MAX_ENTRIES = 50_000_000, 1_000_000
 "Bounds on what is read of one file, a minute of 1 kHz; what comes after is passed over."
 TOPICS = (TELEMETRY_TOPIC, TICKS_TOPIC)
 UNREADABLE = (
-    McapError, ZstdError, EOFError, ValueError, OverflowError, MemoryError, RecursionError, struct.error,
+    McapError, ZstdError, EOFError, OSError, ValueError, OverflowError, MemoryError, RecursionError, struct.error,
     msgspec.MsgspecError,
 )  # fmt: skip
-"What damage raises: MemoryError if a damaged length asks for more than there is."
+"What damage raises: MemoryError and OSError if a length or place is more than there is."
 
 
 class RecordingError(ValueError):
@@ -209,7 +209,7 @@ class Contents:
     def _read_summary(self, file: BinaryIO) -> bool:
         """Read what stands at the end, and return whether all of that is there."""
         told: list[int] = []
-        with contextlib.suppress(*UNREADABLE, OSError):
+        with contextlib.suppress(*UNREADABLE):
             at, _ = _end(file)
             file.seek(at)
             for record in _records(file) if at else ():
@@ -260,7 +260,7 @@ class Contents:
                 chunk = _at(file, place.at, Chunk)
                 size += max(min(chunk.uncompressed_size, MAX_RECORD_BYTES), len(chunk.data))
                 records = _within(chunk)
-            except (*UNREADABLE, OSError) as error:
+            except UNREADABLE as error:
                 self.lost[place.at] = f"byte {place.at}: {str(error)[:80] or repr(error)}"
                 continue
             for record in records:
