@@ -34,7 +34,7 @@ from tormagd.record.keeper import (
     box_path,
     in_shared_memory,
 )
-from tormagd.record.stream import COLUMNS, FORMAT, MISSING, STATE, Journal, Moment, TickRecord, core_hash, packed
+from tormagd.record.stream import COLUMNS, FORMAT, STATE, Journal, Moment, TickRecord, core_hash, packed
 from tormagd_client.messages import BlackBoxReport
 
 KEEPER = "tormagd.record.keeper"
@@ -137,8 +137,7 @@ class BlackBox:
                     "some ticks are in no black box: %s; next: make room in %s, or report that", error, SHARED_MEMORY
                 )
             self._refusal, self._dropped = f"an entry that cannot be written: {error}", self._dropped + 1
-            self.journal.take()
-            self.journal.note(MISSING)
+            self.journal.lose()
             self._ticks = -PART_TICKS  # a snapshot follows the next part
         if self._ticks % self._ticks_per_snapshot == 0:
             self._snapshot(stepper, planner)
@@ -228,8 +227,7 @@ class BlackBox:
 
     def _begin_anew(self, stepper: Stepper, planner: Planner) -> None:
         """Forget what was not handed over."""
-        self.journal.take()
-        self.journal.note(MISSING)
+        self.journal.lose()
         self._snapshot(stepper, planner)
 
     def _snapshot(self, stepper: Stepper, planner: Planner) -> None:

@@ -87,11 +87,15 @@ class Journal:
         entries, self._entries = self._entries, []
         return [each.row() if isinstance(each, Moment) else each for each in entries]
 
+    def lose(self) -> None:
+        """Forget all; MISSING takes their place."""
+        self._entries = [(MISSING,)] if self.is_kept else []
+
     def add(self, entry: Any) -> None:
         if not self.is_kept:
             return
         if len(self._entries) >= MAX_ENTRIES:
-            self._entries = [(MISSING,)]
+            self.lose()
         self._entries.append(entry)
 
 
