@@ -112,7 +112,7 @@ def test_every_fit_can_be_kept(
         zero_N,
         lag_s,
     )
-    assert math.isfinite(learned.device.surely_within_N(2.5, BOUNDS))
+    assert math.isfinite(learned.device.surely_within_N(2.5, (BOUNDS.least, BOUNDS.most)))
 
 
 STRONG = Learned(DeviceFit(1.3, 0.02, 1e-4, 0.0, 1e-4), lag_s=0.02)

@@ -35,6 +35,8 @@ from tormagd.scenes.scene import Scene
 PLAN_ERRORS: Final = (ValueError, ArithmeticError, RuntimeError)
 "What a plan may raise: DomainError and the errors of NumPy."
 _ENABLED: Final = OperatingState.ENABLED
+_RUN: Final = DriveMode.RUN
+_OFF: Final = DriveMode.OFF
 
 
 @final
@@ -79,9 +81,8 @@ class Planner:
         if measured is None or not measured.is_homed:
             return device.force_N(portrait.min_N)
         # the rest of the plan's gap is the element's memory and the handle's rate
-        is_held = Limit.CEILING in planned.limits
-        beside_mm = 0.0 if is_held else planned.gap_mm - portrait.gap_for_mm(planned.governed_N, device)
-        return device.force_N(portrait.force_N_at(measured.gap_mm - beside_mm))
+        is_held, planned_mm = Limit.CEILING in planned.limits, portrait.gap_for_mm(planned.governed_N, device)
+        return device.force_N(portrait.force_N_at(measured.gap_mm + (0.0 if is_held else planned_mm - planned.gap_mm)))
 
     def afresh(self, now_s: float) -> None:
         """Begin again at `now_s` after a failed plan, with nothing known of the device or of setpoints."""
@@ -126,7 +127,7 @@ class Stepper:
         self.time_s = now_s
         if measurement is None:
             self.lose_link()
-            return self._duty(DriveMode.OFF, 0.0, 0.0, ())
+            return self._duty(_OFF, 0.0, 0.0, ())
         if not measurement.is_finite:
             return self._begin_anew()
         measured = self.measure.update(last_s, now_s, measurement, self.safety.needs_homing)
@@ -135,7 +136,7 @@ class Stepper:
             if measurement.is_busy:  # homing moves the origin
                 self.measure.begin(measurement)
             self.move.stop()
-            return self._duty(DriveMode.OFF, 0.0, 0.0, ())
+            return self._duty(_OFF, 0.0, 0.0, ())
         sight = self.measure.sight
         if sight.is_blind or self.measure.leap is not None:
             return self._hold(now_s)
@@ -187,17 +188,18 @@ class Stepper:
         seen = Limit.HOST_STALL if self.measure.sight.has_stalled(now_s) else Limit.DEVICE_SILENT
         limit = seen if self.measure.leap is None else Limit.ENCODER
         self.watch.rest()
-        return self._duty(DriveMode.RUN, 0.0, 0.0, (limit,))
+        return self._duty(_RUN, 0.0, 0.0, (limit,))
 
     def _drive(self, now_s: float, dt_s: float, measurement: Measurement, measured: Measured, plan: Plan) -> Duty:
-        followed = plan if self.is_followed else None
         try:
-            drive = self.move.update(now_s, dt_s, followed, measurement, measured, self.watch.is_over)
+            drive = self.move.update(
+                now_s, dt_s, plan if self.is_followed else None, measurement, measured, self.watch.is_over
+            )
         except DomainError:
             return self._begin_anew()
         self.watch.update(dt_s, measured, self.move.reference, drive.left_motor, drive.right_motor)
         limits = drive.limits + self.watch.limits(now_s, measurement, measured, self.measure.sight)
-        return self._duty(DriveMode.RUN, drive.left_duty, drive.right_duty, limits)
+        return self._duty(_RUN, drive.left_duty, drive.right_duty, limits)
 
     def _begin_anew(self) -> Duty:
         """Latch NOT_FINITE, forget all motion, and stop driving."""
@@ -206,7 +208,7 @@ class Stepper:
         self.watch.begin(math.inf)
         self.watch.rest()
         self.move.forget()
-        return self._duty(DriveMode.OFF, 0.0, 0.0, ())
+        return self._duty(_OFF, 0.0, 0.0, ())
 
     def _duty(self, mode: DriveMode, left: float, right: float, limits: tuple[Limit, ...]) -> Duty:
         return Duty(mode, left, right, self.safety.request, self.safety.request_number, limits)

@@ -11,7 +11,7 @@ from typing import Final, TypeAlias, final
 from tormagd.control.records import Measured, Outside, TimedSetpoint
 from tormagd.element.model.displacement import MOBILISED_MM, MOVING_MM_S
 from tormagd.element.model.features import FEATURES
-from tormagd.element.model.force_curve import ForceCurve, within
+from tormagd.element.model.force_curve import NetworkCurve, within
 from tormagd.element.model.model_file import ForceModel
 from tormagd.element.physics.errors import DomainError
 from tormagd.element.physics.field import PowerFieldLaw, flux_density_T
@@ -117,15 +117,15 @@ class Nominal:
         self._displacements_mm: Final = (mobilised_mm, mobilised_mm) if contact.slides else known_mm
         self._rates_mm_s: Final = model.feature_ranges[1]
         self.fields_mT: Final = model.feature_ranges[2]
-        self.only: Final[ForceCurve] = self.curve(contact.displacement_mm, contact.rate_mm_s)
+        self.only: Final = self.curve(contact.displacement_mm, contact.rate_mm_s)
 
-    def now(self, measured: Measured) -> ForceCurve:
+    def now(self, measured: Measured) -> NetworkCurve:
         displacement_mm, rate_mm_s = self.contact.motion_now(measured)
         return self.curve(displacement_mm, rate_mm_s) if self._has_rate else self.only
 
     def planned(
         self, setpoint: TimedSetpoint | None, measured: Measured | None
-    ) -> tuple[ForceCurve, tuple[Outside, ...]]:
+    ) -> tuple[NetworkCurve, tuple[Outside, ...]]:
         """Return the force over the field for the motion to plan for, and what of it is out of range."""
         if not self._has_rate:
             return self.only, ()
@@ -139,6 +139,6 @@ class Nominal:
             + ((Outside(FEATURES[1], rate_mm_s, known_mm_s),) if known_mm_s != rate_mm_s else ())
         )
 
-    def curve(self, displacement_mm: float, rate_mm_s: float) -> ForceCurve:
+    def curve(self, displacement_mm: float, rate_mm_s: float) -> NetworkCurve:
         known_mm, known_mm_s = within(displacement_mm, self._displacements_mm), within(rate_mm_s, self._rates_mm_s)
         return self._network.curve(known_mm, known_mm_s, self._cip_percent)

@@ -202,9 +202,9 @@ def test_the_most_open_of_the_guards_wins_at_a_speed_that_there_is(
     planner = core.planner()
     ask = Ask(asked_N, [asked_N, *[0.5] * 6], None, ())
     plan = planner.aim.update(0.1, None, ask, belief, planner.believe.memory, None)
-    ceiling_N = CEILING * core.scene.force.most_N
+    ceiling_N, scales = CEILING * core.scene.force.most_N, (CONFIG.trim.least, CONFIG.trim.most)
     for guard in (device, unseen):
-        assert guard is None or plan.gap_mm >= core.portrait.gap_mm_at(guard.surely_within_N(ceiling_N, CONFIG.trim))
+        assert guard is None or plan.gap_mm >= core.portrait.gap_mm_at(guard.surely_within_N(ceiling_N, scales))
     assert plan.gap_mm >= plan.min_gap_mm
     assert -core.gap_speeds.closing_mm_s <= plan.gap_speed_mm_s <= CONFIG.position.gap_speed_mm_s
 

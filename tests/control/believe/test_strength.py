@@ -2,11 +2,9 @@
 
 import math
 
-import msgspec
 import numpy as np
 import pytest
 
-from tormagd.config import Trim
 from tormagd.control.believe.strength import (
     ERROR_N2_S,
     OFFSET_SD_N,
@@ -21,7 +19,8 @@ from tormagd.control.believe.strength import (
 )
 
 PERIOD_S = 0.004
-BOUNDS = Trim(time_s=0.5, least=0.6, most=1.6, least_offset_N=-0.2, most_offset_N=0.3)
+LEAST, MOST = SCALES = (0.6, 1.6)
+OFFSETS_N = (-0.2, 0.3)
 
 
 def shown(
@@ -36,7 +35,9 @@ def shown(
     for seconds, model_N in levels:
         for noise_N in random.normal(0.0, 0.01, round(seconds / PERIOD_S)).tolist():
             measured_N = scale * model_N + offset_N + noise_N
-            fit, _ = observe(fit, model_N, measured_N, PERIOD_S, adapts_in_s=adapts_in_s, bounds=BOUNDS)
+            fit, _ = observe(
+                fit, model_N, measured_N, PERIOD_S, adapts_in_s=adapts_in_s, scales=SCALES, offsets_N=OFFSETS_N
+            )
     return fit
 
 
@@ -63,12 +64,12 @@ def test_an_offset_is_learned_in_its_time_and_the_scale_stays() -> None:
 
 
 def test_a_scale_beyond_its_bounds_is_held_and_said() -> None:
-    by_offset = msgspec.structs.replace(BOUNDS, most_offset_N=2.9)
-    fit, is_held = observe(DeviceFit(1.0, 0.05), 2.0, 6.0, 1.0, adapts_in_s=0.5, bounds=by_offset)
-    assert (is_held, fit.scale) == (True, BOUNDS.most)
+    before = DeviceFit(1.0, 0.05)
+    fit, is_held = observe(before, 2.0, 6.0, 1.0, adapts_in_s=0.5, scales=SCALES, offsets_N=(-0.2, 2.9))
+    assert (is_held, fit.scale) == (True, MOST)
     assert fit.force_N(2.0) == pytest.approx(6.0, abs=0.1), "the offset takes what is left"
-    held, is_held = observe(DeviceFit(1.0, 0.05), 2.0, 6.0, 1.0, adapts_in_s=0.5, bounds=BOUNDS)
-    assert (is_held, held.scale, held.offset_N) == (True, BOUNDS.most, BOUNDS.most_offset_N)
+    held, is_held = observe(before, 2.0, 6.0, 1.0, adapts_in_s=0.5, scales=SCALES, offsets_N=OFFSETS_N)
+    assert (is_held, held.scale, held.offset_N) == (True, MOST, OFFSETS_N[1])
 
 
 STRONGEST = 1.53
@@ -76,26 +77,26 @@ STRONGEST = 1.53
 
 
 @pytest.mark.parametrize("levels", [[], [(0.2, 0.7)], [(2.0, 0.7)], [(2.0, 0.7), (2.0, 1.6)]])
-@pytest.mark.parametrize("scale", [BOUNDS.least, 0.8, 1.0, 1.2, STRONGEST])
+@pytest.mark.parametrize("scale", [LEAST, 0.8, 1.0, 1.2, STRONGEST])
 def test_what_is_surely_within_is_within(levels: list[tuple[float, float]], scale: float) -> None:
     most_N = 2.5
-    model_N = shown(levels, scale, 0.0).surely_within_N(most_N, BOUNDS)
+    model_N = shown(levels, scale, 0.0).surely_within_N(most_N, SCALES)
     assert scale * model_N <= 1.03 * most_N * (1.0 if levels else STRONGEST / (1.0 + SURE * SCALE_SD))
-    assert most_N / BOUNDS.most <= model_N <= most_N / BOUNDS.least
+    assert most_N / MOST <= model_N <= most_N / LEAST
 
 
 def test_the_ceiling_moves_once_a_weak_device_has_shown_itself() -> None:
     weak = shown([(2.0, 0.7), (2.0, 1.6)], 0.75, 0.0)
-    assert weak.surely_within_N(2.5, BOUNDS) > 1.5 * DeviceFit().surely_within_N(2.5, BOUNDS)
+    assert weak.surely_within_N(2.5, SCALES) > 1.5 * DeviceFit().surely_within_N(2.5, SCALES)
 
 
 def test_a_device_of_which_nothing_is_sure_is_taken_for_the_strongest() -> None:
-    assert DeviceFit(scale=2.0 * SCALE_SD).surely_within_N(2.5, BOUNDS) == 2.5 / BOUNDS.most
+    assert DeviceFit(scale=2.0 * SCALE_SD).surely_within_N(2.5, SCALES) == 2.5 / MOST
 
 
 def test_where_stronger_devices_are_allowed_the_ceiling_holds_for_them() -> None:
     strong = DeviceFit(3.0, scale_variance=0.0, offset_variance_N2=0.0)
-    assert strong.force_N(strong.surely_within_N(2.5, Trim(most=4.0))) == pytest.approx(2.5)
+    assert strong.force_N(strong.surely_within_N(2.5, (LEAST, 4.0))) == pytest.approx(2.5)
 
 
 @pytest.mark.parametrize("relaxed_N", [0.0, 0.1, 0.25])
@@ -137,7 +138,10 @@ def test_what_is_known_is_forgotten_in_its_time() -> None:
 
 @pytest.mark.parametrize("learns", [(True, False), (False, True), (False, False)])
 def test_what_is_left_out_keeps_its_uncertainty_and_is_counted_with(learns: tuple[bool, bool]) -> None:
-    fit, terms = DeviceFit(1.1, 0.02, 0.02, 0.001, 0.008), {"adapts_in_s": 0.5, "bounds": BOUNDS}
+    fit, terms = (
+        DeviceFit(1.1, 0.02, 0.02, 0.001, 0.008),
+        {"adapts_in_s": 0.5, "scales": SCALES, "offsets_N": OFFSETS_N},
+    )
     found, _ = observe(fit, 1.5, 1.7, 0.01, learns=learns, **terms)
     aged, _ = observe(fit, 1.5, 1.7, 0.01, learns=(False, False), **terms)
     before = np.array([[aged.scale_variance, aged.covariance_N], [aged.covariance_N, aged.offset_variance_N2]])

@@ -67,7 +67,7 @@ class Aim:
         self._portrait: Final = element.portrait
         self._range_mm: Final = (scene.insert.gap_closed_mm, scene.insert.gap_open_mm)
         self._ceiling_N: Final = CEILING * scene.force.most_N
-        self._bounds: Final = config.trim
+        self._scales: Final = (config.trim.least, config.trim.most)
         self._speeds: Final = gap_speeds(config)
         self._max_mm_s2: Final = config.position.gap_acceleration_mm_s2
         self._low_confidence: Final = config.limits.low_confidence
@@ -103,7 +103,7 @@ class Aim:
         # the field grid ends where the gap range ends, up to rounding
         wanted_mm = within(self._element.field.gap_mm(field_mT), self._range_mm)
         wanted_mm = self._reached_mm(wanted_mm, before, now_s, ask, device)
-        min_mm = least_mm(self._portrait, belief, self._ceiling_N, self._bounds)
+        min_mm = least_mm(self._portrait, belief, self._ceiling_N, self._scales)
         self.element_mT = field_mT - memory.lag_mT
         self.number += 1
         return self._plan(now_s, setpoint, ask, belief, field_mT, wanted_mm, min_mm, solution, outside)

@@ -5,7 +5,6 @@ from typing import Final, final
 import numpy as np
 import numpy.typing as npt
 
-from tormagd.config import Trim
 from tormagd.control.believe.strength import DeviceFit
 from tormagd.control.interpolation import Rising, at_step, interpolated, interpolated_before
 from tormagd.control.nominal import FieldOfGap
@@ -98,9 +97,9 @@ def portrait(curve: ForceCurve, field: FieldOfGap, gap_range_mm: tuple[float, fl
     return Portrait(gap_mm, forces_N.tolist(), slopes)
 
 
-def least_mm(portrait: Portrait, belief: Belief, ceiling_N: float, bounds: Trim) -> float:
+def least_mm(portrait: Portrait, belief: Belief, ceiling_N: float, scales: tuple[float, float]) -> float:
     """Return the least gap allowed for the believed device, and for an unseen one where there is one."""
-    model_N = min(belief.device.surely_within_N(ceiling_N, bounds), belief.anchor_N)
+    model_N = min(belief.device.surely_within_N(ceiling_N, scales), belief.anchor_N)
     if belief.unseen is not None:
-        model_N = min(model_N, belief.unseen.surely_within_N(ceiling_N, bounds))
+        model_N = min(model_N, belief.unseen.surely_within_N(ceiling_N, scales))
     return portrait.gap_mm_at(model_N)

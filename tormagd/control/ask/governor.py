@@ -77,7 +77,7 @@ class Governor:
         self._has_forecast: Final = terms.forecast
         self._portrait: Final = portrait
         self._speeds: Final = speeds
-        self._force: Final = force
+        self._release_N_s, self._least_N, self._decays = force.release_N_s, force.least_N, force.breakthrough == "decay"
         self._allowed: Final = (force.waiting_N, force.most_N)
         self.forecast = Forecast()
         self.begin(now_s)
@@ -107,20 +107,21 @@ class Governor:
         if held_N is not None:
             self.is_passing, dt_s = True, 0.0
             self._stand_at(held_N, device)
-        age_s, limits = None, [Limit.NO_SETPOINT]
         if setpoint is not None:
-            age_s = now_s - setpoint.stamp_s
             setpoint.require_numbers()
             is_new = self.last is None or setpoint.stamp_s != self.last.stamp_s
             self.silent_s = 0.0 if is_new else self.silent_s + dt_s
-            if age_s <= setpoint.valid_for_s:
-                return self._followed(setpoint, age_s, device, lag_s, travel, dt_s, given, held_N is None)
-            limits = [Limit.STALE, *setpoint.limits]
+            if now_s - setpoint.stamp_s <= setpoint.valid_for_s:
+                return self._followed(
+                    setpoint, now_s - setpoint.stamp_s, device, lag_s, travel, dt_s, given, held_N is None
+                )
         # where a device turns out weaker, the gap does not close for it
         left_N = min(self.asked_N, device.force_N(self._portrait.force_N_at(self.from_mm)))
-        self._stand_at(max(left_N - self._force.release_N_s * dt_s, given[0]), device)
+        self._stand_at(max(left_N - self._release_N_s * dt_s, given[0]), device)
         self._forget()
-        return Ask(self.asked_N, [self.asked_N] * len(PATH_S), age_s, tuple(limits))
+        limits = (Limit.NO_SETPOINT,) if setpoint is None else (Limit.STALE, *setpoint.limits)
+        age_s = None if setpoint is None else now_s - setpoint.stamp_s
+        return Ask(self.asked_N, [self.asked_N] * len(PATH_S), age_s, limits)
 
     def _followed(
         self,
@@ -133,7 +134,7 @@ class Governor:
         given: tuple[float, float],
         is_free: bool,
     ) -> Ask:
-        asked_N, step_N = setpoint.asked_N(travel), self._force.release_N_s * dt_s
+        asked_N, step_N = setpoint.asked_N(travel), self._release_N_s * dt_s
         allowed_N = within(asked_N, self._allowed)
         lawful_N = self._lawful_N(setpoint, travel, allowed_N, step_N)
         blend_N, force_N = lawful_N - allowed_N, within(lawful_N, given)
@@ -161,15 +162,15 @@ class Governor:
         self, setpoint: TimedSetpoint, asked_N: float, lawful_N: float, given: tuple[float, float], is_late: bool
     ) -> tuple[Limit, ...]:
         """Return what holds the force that is asked for now."""
-        least_N, (waiting_N, most_N) = self._force.least_N, self._allowed
+        waiting_N, most_N = self._allowed
         return (
-            *((Limit.RANGE,) if not least_N <= asked_N <= most_N else ()),
-            *((Limit.STANDBY,) if least_N < waiting_N > asked_N else ()),
-            *((Limit.F_MIN,) if lawful_N < given[0] else ()),
-            *((Limit.F_MAX,) if lawful_N > given[1] else ()),
-            *setpoint.limits,
-            *((Limit.RATE,) if is_late else ()),
-            *((Limit.TAKEOVER,) if self.is_passing else ()),
+            ((Limit.RANGE,) if not self._least_N <= asked_N <= most_N else ())
+            + ((Limit.STANDBY,) if self._least_N < waiting_N > asked_N else ())
+            + ((Limit.F_MIN,) if lawful_N < given[0] else ())
+            + ((Limit.F_MAX,) if lawful_N > given[1] else ())
+            + setpoint.limits
+            + ((Limit.RATE,) if is_late else ())
+            + ((Limit.TAKEOVER,) if self.is_passing else ())
         )
 
     def _lawful_N(self, setpoint: TimedSetpoint, travel: Travel, allowed_N: float, step_N: float) -> float:
@@ -180,7 +181,7 @@ class Governor:
             rises_N = falls_N = step_N
             if wall is not None:
                 rises_N = falls_N = step_N + wall.stiffness_N_mm * abs(travel.place_mm - self.target_mm)
-            elif self._force.breakthrough == "decay":
+            elif self._decays:
                 rises_N, falls_N = ENDLESS, DECAY * step_N
             elif last.wall is None and before_N == within(last.force_N, self._allowed):
                 rises_N = falls_N = ENDLESS

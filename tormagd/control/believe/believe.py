@@ -98,8 +98,11 @@ class Believe:
         """Begin with an unseen device."""
         self.memory = memory
         self.learns = scene.terms.learning
-        self._terms: Final = scene.terms
+        self._has_motor: Final = scene.terms.motor
+        self._fits: Final = (scene.terms.scale, scene.terms.offset)
         self._trim: Final = config.trim
+        self._scales: Final = (config.trim.least, config.trim.most)
+        self._offsets_N: Final = (config.trim.least_offset_N, config.trim.most_offset_N)
         self._radius_mm: Final = scene.insert.roller_radius_mm
         self._surely_N: Final = scene.force.most_N + OVER_N
         self._nominal: Final = nominal
@@ -156,7 +159,7 @@ class Believe:
 
     def learn_lag(self, dt_s: float, measured: Measured | None, foresight: float, planned_mm: float) -> None:
         """Learn the carriages' lag from the gap of a plan, `planned_mm`, which came `dt_s` after the last plan."""
-        if self.learns and self._terms.motor and measured is not None:
+        if self.learns and self._has_motor and measured is not None:
             known_mm = planned_mm if measured.is_homed and foresight >= MIN_FORESIGHT else None
             self.carriages.update(dt_s, known_mm, measured.gap_mm, measured.gap_speed_mm_s, self._top_speed_mm_s)
 
@@ -167,7 +170,7 @@ class Believe:
             device=at_speed.times(slow * ripple),
             at_speed=at_speed,
             unseen=UNSEEN.relaxed(self.memory.relaxed_N) if self.is_prior and not has_slid else None,
-            lag_s=self.carriages.lag_s if self._terms.motor else 0.0,
+            lag_s=self.carriages.lag_s if self._has_motor else 0.0,
             predicted_N=predicted_N,
             limits=(*self.limits, Limit.HANDLE_LOST) if self.handle.is_lost else self.limits,
             sensor_doubted_s=self.sensor.doubted_s,
@@ -233,8 +236,7 @@ class Believe:
     def _hear_at_speed(self, now_s: float, measured: Measured, reading_N: float, model_N: float, dt_s: float) -> None:
         """Take one reading of a handle that slides at speed."""
         rate_mm_s, angle = abs(measured.handle.rate_mm_s), measured.handle_mm / self._radius_mm
-        zero, fit, sensor = self.zero, self.fit, self.sensor
-        zero_sd_N = zero.sd_N(now_s)
+        zero, fit, sensor, zero_sd_N = self.zero, self.fit, self.sensor, self.zero.sd_N(now_s)
         # an anchor that was learned one way only was misread
         sensor.anchor.values[1] += zero.update(
             now_s,
@@ -286,8 +288,9 @@ class Believe:
             reading_N,
             dt_s,
             adapts_in_s=adapting_s(self._trim.time_s, mean_N - before_N),
-            bounds=self._trim,
-            learns=(self._terms.scale, self._terms.offset),
+            scales=self._scales,
+            offsets_N=self._offsets_N,
+            learns=self._fits,
         )
         if is_held:
             self.limits = (Limit.TRIM, *self.limits)

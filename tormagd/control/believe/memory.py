@@ -13,7 +13,7 @@ from typing import Final, final
 
 from tormagd.control.nominal import FieldOfGap, Nominal
 from tormagd.control.records import Measured
-from tormagd.element.model.force_curve import ForceCurve, within
+from tormagd.element.model.force_curve import NetworkCurve, within
 from tormagd.element.model.memory import Memory
 from tormagd.element.physics.relaxation import PronyState
 
@@ -42,9 +42,8 @@ class ElementMemory:
 
     def __init__(self, memory: Memory, nominal: Nominal, field: FieldOfGap, gap_range_mm: tuple[float, float]) -> None:
         """Begin before the first known gap."""
-        self._free: Final = memory.free
-        self._added: Final = memory.added
-        self._memory: Final = memory
+        self._free, self._added = memory.free, memory.added
+        self._width_mT, self._turn_mT = memory.lag_mT, memory.turn_mT
         self._nominal: Final = nominal
         self._slides: Final = nominal.contact.slides
         self._field: Final = field
@@ -62,15 +61,15 @@ class ElementMemory:
         change_mT = field_mT - self.field_mT
         if change_mT == 0.0 or self.time_s == math.inf:
             return self.lag_mT
-        side_mT = math.copysign(self._memory.lag_mT, change_mT)
-        return side_mT + (self.lag_mT - side_mT) * math.exp(-abs(change_mT) / self._memory.turn_mT)
+        side_mT = math.copysign(self._width_mT, change_mT)
+        return side_mT + (self.lag_mT - side_mT) * math.exp(-abs(change_mT) / self._turn_mT)
 
     def open_N(self) -> float:
         """Return the model's force, N, once the gap has gone straight open, less nothing that has relaxed."""
         # within 0.3 mN, and no question to the network
         return self._open_N - self._open_N_mT * self.lag_at_mT(self._open_mT)
 
-    def force_N(self, curve: ForceCurve) -> float:
+    def force_N(self, curve: NetworkCurve) -> float:
         """Return the model's force now, N, with memory; `curve` is its force over the field without."""
         return self._force_N(curve, self.field_mT - self.lag_mT) - self.relaxed_N
 
@@ -87,7 +86,7 @@ class ElementMemory:
             self._begin(curve, gap_mm, free_N, now_s)
         self._follow(curve, free_N, self._field.field_mT(gap_mm), now_s)
 
-    def _begin(self, curve: ForceCurve, gap_mm: float, free_N: float, now_s: float) -> None:
+    def _begin(self, curve: NetworkCurve, gap_mm: float, free_N: float, now_s: float) -> None:
         """Begin relaxed at the gap at which a brake was switched on, and with nothing relaxed on a pad."""
         found_mm = gap_mm - self.opened_mm
         is_known = self._least_mm <= found_mm <= self._open_mm + BEYOND_MM
@@ -96,7 +95,7 @@ class ElementMemory:
         self.free = self._free.relaxed(free_N if self._slides else 0.0)
         self.added = self._added.relaxed(self._force_N(curve, self.field_mT) - free_N if self._slides else 0.0)
 
-    def _follow(self, curve: ForceCurve, free_N: float, field_mT: float, now_s: float) -> None:
+    def _follow(self, curve: NetworkCurve, free_N: float, field_mT: float, now_s: float) -> None:
         """Follow a straight change of the gap's field to `field_mT` at `now_s`."""
         self.lag_mT = self.lag_at_mT(field_mT)
         dt_s = max(now_s - self.time_s, 0.0)
@@ -109,5 +108,5 @@ class ElementMemory:
         left_of_added_N, self.added = step.of(self._added.fractions).advance(self.added, added_N)
         self.relaxed_N = free_N + added_N - left_N - left_of_added_N
 
-    def _force_N(self, curve: ForceCurve, field_mT: float) -> float:
+    def _force_N(self, curve: NetworkCurve, field_mT: float) -> float:
         return curve.force_N(within(field_mT, self._nominal.fields_mT))

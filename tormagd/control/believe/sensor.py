@@ -69,7 +69,7 @@ class SensorTrust:
     "How long they have been such as no device gives; falls while they are not."
 
     def __init__(self, trim: Trim, known: DeviceFit = UNSEEN) -> None:
-        self._trim: Final = trim
+        self._least, self._most, self._leash = trim.least, trim.most, trim.leash
         self.freshness = Freshness()
         self.anchor = Anchor(known)
 
@@ -102,12 +102,12 @@ class SensorTrust:
         force_N, deviation_N = max(self.anchor.force_N(model_N), 0.0), self.anchor.deviation_N(model_N)
         self.off_N = low_pass(self.off_N, reading_N - force_N, dt_s, FILTER_S)
         unsure_N = SLACK_N + SURE * max(zero_sd_N - UNKNOWN_SD_N, 0.0)
-        least_N = self._trim.least * (1.0 - WEAKENED) * model_N - unsure_N
-        most_N = self._trim.most * (1.0 + WEAKENED) * model_N + unsure_N
+        least_N = self._least * (1.0 - WEAKENED) * model_N - unsure_N
+        most_N = self._most * (1.0 + WEAKENED) * model_N + unsure_N
         is_strange = is_frozen or not least_N <= force_N + self.off_N <= most_N
         surely_N = SURE * max(deviation_N - 2.0 * KNOWN_N, 0.0)
         unsure_N += SURE * VISCOUS_N_S_MM * abs(rate_mm_s - self.rate_mm_s)
-        beyond_N = abs(self.off_N) - self._trim.leash * force_N - unsure_N - KNOWN_N - surely_N
+        beyond_N = abs(self.off_N) - self._leash * force_N - unsure_N - KNOWN_N - surely_N
         teaches = self._judge(is_strange, beyond_N <= 0.0, is_stale, dt_s)
         leapt_N = (1.0 - LEAPT) * force_N - unsure_N - surely_N if self.has_slid else least_N
         if not (teaches and max(least_N, leapt_N) <= reading_N <= most_N):
@@ -134,7 +134,7 @@ class SensorTrust:
             self.below_s = within(self.below_s + (dt_s if self.off_N < 0.0 else -dt_s), (0.0, 2.0 * LEARNS_S))
         # a fall where it is known teaches nothing lower where it is half known
         if deviation_N <= (2.0 * KNOWN_N if self.below_s > LEARNS_S and self.off_N < 0.0 else KNOWN_N):
-            self.fallen = within(believed, (self._trim.least, 1.0))
+            self.fallen = within(believed, (self._least, 1.0))
         else:
             self.rate_mm_s = low_pass(self.rate_mm_s, rate_mm_s, dt_s, LEARNS_S)
             if self.has_slid:
@@ -149,7 +149,7 @@ class SensorTrust:
         # what is lost in the slack is given way, too: readings at its end would teach only their noise
         self.low_s = self.low_s + dt_s if force_N + self.off_N < self.share * force_N else 0.0
         falls = FALLS_1_S * dt_s if self.low_s > LEARNS_S else 0.0
-        self.share = within(max(self.share - falls, believed), (1.0 - self._trim.leash, 1.0))
+        self.share = within(max(self.share - falls, believed), (1.0 - self._leash, 1.0))
 
     def _judge(self, is_strange: bool, is_inside: bool, is_stale: bool, dt_s: float) -> bool:
         """Weigh how long readings were such as no device gives, or outside the leash; return whether they teach."""

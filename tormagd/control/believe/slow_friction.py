@@ -43,11 +43,11 @@ class SlowFriction:
     "e(v) where it was learned, by the same low pass; 1, as at rest, until then."
 
     def __init__(self, bounds: Trim) -> None:
-        self._bounds: Final = bounds
+        self._least, self._factors = bounds.least, factor_bounds(bounds)
 
     def factor_at(self, rate_mm_s: float) -> float:
         """Return the factor on the force of a handle that slides at `rate_mm_s` >= 0: 1 at speed, k at rest."""
-        return 1.0 + _slowness(rate_mm_s) * (within(self.factor, factor_bounds(self._bounds)) - 1.0)
+        return 1.0 + _slowness(rate_mm_s) * (within(self.factor, self._factors) - 1.0)
 
     def rescale(self, before_N: float, after_N: float, rate_mm_s: float) -> None:
         """Change k so that the force at a creep stays while the fit's force at speed goes from `before_N`
@@ -55,17 +55,17 @@ class SlowFriction:
         if before_N > 0.0 and after_N > 0.0:
             kept = self.learned * max(1.0 - _slowness(rate_mm_s) / self.slowness, 0.0)
             at_creep = (1.0 + self.slowness * (self.factor - 1.0)) * math.pow(before_N / after_N, kept)
-            self.factor = 1.0 + (within(at_creep, factor_bounds(self._bounds)) - 1.0) / self.slowness
+            self.factor = 1.0 + (within(at_creep, self._factors) - 1.0) / self.slowness
 
     def update(self, fit: DeviceFit, model_N: float, rate_mm_s: float, reading_N: float, dt_s: float) -> None:
         """Learn k from one reading at a creep of `rate_mm_s`, which stands for `dt_s`."""
-        if reading_N < self._bounds.least * (1.0 - MAX_RELAXED) * model_N - NOISE_N:
+        if reading_N < self._least * (1.0 - MAX_RELAXED) * model_N - NOISE_N:
             return
         slowness = _slowness(rate_mm_s)
         share = slowness * dt_s / (LEARNED_S + dt_s)
         shown = 1.0 + (reading_N / fit.force_N(model_N) - 1.0) / slowness
         unsure = BELIEVED_SD * fit.deviation_N(model_N) / fit.force_N(model_N)
-        least, most = factor_bounds(self._bounds)
+        least, most = self._factors
         believed = max(MIN_STATIC - unsure, least), min(MAX_STATIC + unsure, most)
         self.factor = within(self.factor + share * (shown - self.factor), believed)
         self.learned += share * (1.0 - self.learned)

@@ -16,7 +16,6 @@ import math
 from typing import Final, final
 
 from firmware_protocol.value import Value
-from tormagd.config import Trim
 from tormagd.element.model.force_curve import within
 
 SCALE_SD: Final = 0.17
@@ -107,7 +106,7 @@ class DeviceFit(Value):
             self.offset_variance_N2 + relaxed_N * (by_scale_N - 2.0 * self.covariance_N),
         )
 
-    def surely_within_N(self, max_N: float, bounds: Trim) -> float:
+    def surely_within_N(self, max_N: float, scales: tuple[float, float]) -> float:
         """Return the model's force, N, at which the device, taken SURE deviations stronger, gives `max_N`."""
         # scale m + offset + SURE sqrt(variance of that) = max, a quadratic: the smaller root is where the sum is meant
         room_N, sure = max_N - self.offset_N, SURE * SURE
@@ -115,10 +114,10 @@ class DeviceFit(Value):
         half = self.scale * room_N + sure * self.covariance_N
         rest = room_N * room_N - sure * self.offset_variance_N2
         if square <= 0.0:  # the scale is too uncertain
-            return max_N / bounds.most
+            return max_N / scales[1]
         return within(
             (half - math.sqrt(max(half * half - square * rest, 0.0))) / square,
-            (max_N / bounds.most, max_N / bounds.least),
+            (max_N / scales[1], max_N / scales[0]),
         )
 
 
@@ -151,10 +150,11 @@ def observe(
     dt_s: float,
     *,
     adapts_in_s: float,
-    bounds: Trim,
+    scales: tuple[float, float],
+    offsets_N: tuple[float, float],
     learns: tuple[bool, bool] = (True, True),
 ) -> tuple[DeviceFit, bool]:
-    """Return the fit after one reading, which stands for `dt_s` > 0, and whether one of the `bounds` held it."""
+    """Return the fit after one reading, which stands for `dt_s` > 0, and whether `scales` or `offsets_N` held it."""
     prior = forgotten(fit, dt_s, adapts_in_s)
     noise_N2 = ERROR_N2_S / dt_s
     by_scale = model_N * prior.scale_variance + prior.covariance_N
@@ -164,13 +164,13 @@ def observe(
     gain_offset = by_offset / innovation_variance if learns[1] else 0.0
     error_N = measured_N - fit.force_N(model_N)
     wanted = fit.scale + gain_scale * error_N
-    scale = within(wanted, (bounds.least, bounds.most))
+    scale = within(wanted, scales)
     offset_N = fit.offset_N + gain_offset * error_N
     if scale != wanted and learns[1]:
         # a scale that is held is known: what is left of the error is the offset's alone
         by_itself = prior.offset_variance_N2 / (prior.offset_variance_N2 + noise_N2)
         offset_N = fit.offset_N + by_itself * (measured_N - scale * model_N - fit.offset_N)
-    held_N = within(offset_N, (bounds.least_offset_N, bounds.most_offset_N))
+    held_N = within(offset_N, offsets_N)
     learned = DeviceFit(
         scale,
         held_N,
@@ -183,7 +183,7 @@ def observe(
 
 @final
 class Anchor:
-    """Estimator of a device's force that forgets nothing. It keeps (s, o, q, h) with their covariance.
+    """Estimator of (s, o, q, h), with their covariance.
 
     Since a fit was learned the elastomer has rested: its offset is as wide as an unseen device's.
     """
@@ -219,10 +219,10 @@ class Anchor:
         gains = [_dot(row, terms) for row in self.covariance]
         variance_N2 = _dot(gains, terms) + CURVE_ERROR_N2_S / dt_s
         error_N = reading_N - self.force_N(model_N)
-        self.values = [value + gain * error_N / variance_N2 for value, gain in zip(self.values, gains, strict=True)]
+        self.values = [value + gain * error_N / variance_N2 for value, gain in zip(self.values, gains)]  # noqa: B905
         self.covariance = [
-            [each - gain * other / variance_N2 for each, other in zip(row, gains, strict=True)]
-            for row, gain in zip(self.covariance, gains, strict=True)
+            [each - gain * other / variance_N2 for each, other in zip(row, gains)]  # noqa: B905
+            for row, gain in zip(self.covariance, gains)  # noqa: B905
         ]
 
 
