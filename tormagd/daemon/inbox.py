@@ -17,7 +17,7 @@ from tormagd.control.records import TimedSetpoint, Wall
 from tormagd.control.safety.codes import Explanation, Limit
 from tormagd.control.safety.operating_state import RefusedError
 from tormagd.daemon.rate_group import Histogram
-from tormagd.daemon.source import JITTER_SHARE, Needs, Order, Source, needs_of
+from tormagd.daemon.source import JITTER_SHARE, NEWER, STRAY, Needs, Source, needs_of
 from tormagd.scenes.scene import Scene
 from tormagd_client.messages import MessageError, PlayoutReport, Setpoint, SetpointReport, decode
 
@@ -91,7 +91,7 @@ class SetpointInbox:
         except MessageError as error:
             self._refuse(str(error))
             return False
-        if order is Order.STRAY:
+        if order is STRAY:
             self.dropped += 1
             return False
         if name != self.holder:
@@ -104,7 +104,7 @@ class SetpointInbox:
                 self.refused += 1
                 return False
             self._hand_over(name, "that is stale" if is_free else "it goes before that")
-        elif order is not Order.NEWER:
+        elif order is not NEWER:
             self._number += 1  # another process sends as this source now
         source.accepted += 1
         self.accepted += 1

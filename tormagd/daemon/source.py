@@ -10,7 +10,7 @@ arguments.
 import math
 import time
 from enum import Enum
-from typing import NamedTuple, final
+from typing import Final, NamedTuple, final
 
 from msgspec import UNSET
 
@@ -72,6 +72,12 @@ class Order(Enum):
     "Old, repeated, or from another run."
 
 
+# looking a member up takes longer than comparing it
+NEWER: Final = Order.NEWER
+NEW_RUN: Final = Order.NEW_RUN
+STRAY: Final = Order.STRAY
+
+
 @final
 class Sequence:
     """Follows a publisher's count `seq` through restarts. `session` is None if the publisher sends none."""
@@ -96,7 +102,7 @@ class Sequence:
                 if known == 0 or step < known:
                     self._step = step
                 self.seq, self._in_row = seq, 0
-                return Order.NEWER
+                return NEWER
         if session is not None and (self._latest_session is None or session > self._latest_session):
             self._latest_session = session
             return self._begin(session, seq)
@@ -109,7 +115,7 @@ class Sequence:
         if now_s - self._strays_since_s > STRAYS_S:
             self._strays, self._strays_since_s = 0, now_s
         self._strays += 1
-        return Order.STRAY
+        return STRAY
 
     def is_doubled(self, now_s: float) -> bool:
         return self._strays >= RUN and now_s - self._strays_since_s <= STRAYS_S
@@ -118,7 +124,7 @@ class Sequence:
         self.session, self.seq, self._step = session, seq, 0
         self._in_row = self._strays = self.missing = 0
         self.restarts += 1
-        return Order.NEW_RUN
+        return NEW_RUN
 
 
 @final
@@ -266,7 +272,7 @@ class Source:
         self.found: dict[Limit, Explanation] = {}
         self.cause = self.remedy = ""
         self._is_named = False
-        self._begun = Order.NEWER
+        self._begun = NEWER
         self._unit = ""
         self._began_s: float | None = None
         self._sent_s = 0.0
@@ -274,26 +280,26 @@ class Source:
 
     def judge(self, setpoint: Setpoint, now_s: float, realtime_ns: int, playout_s: float, needs: Needs) -> Order:
         """Judge a message, and keep it as the newest unless it is a stray."""
-        order = Order.NEWER
+        order = NEWER
         if self.heard_s > -math.inf:
             is_over = self.is_stale(now_s)
             order = self.sequence.order(now_s, setpoint.session, setpoint.seq, is_over=is_over)
-            if order is Order.STRAY:
+            if order is STRAY:
                 return order
-            if order is not Order.NEWER:
+            if order is not NEWER:
                 self._begun = order
         self.heard_s = now_s
         self._require_ns(setpoint, realtime_ns)
         lateness_s = (realtime_ns - setpoint.stamp_ns) * 1e-9
-        delay_s = self.clock.hear(now_s, lateness_s, is_continued=order is Order.NEWER)
+        delay_s = self.clock.hear(now_s, lateness_s, is_continued=order is NEWER)
         if not -AHEAD_S <= delay_s <= FAR_S:
             raise MessageError(
                 f"stamp_ns is {abs(delay_s):.3f} s {'ahead of' if delay_s < 0.0 else 'behind'} this clock: allowed are "
                 f"{AHEAD_S:g} s ahead and {FAR_S:.0f} s behind, until the clock of its source has shown itself"
             )
         self.setpoint, self.stamp_s = setpoint, now_s - max(delay_s, 0.0)
-        order, self._begun = self._begun, Order.NEWER
-        if order is not Order.NEWER:
+        order, self._begun = self._begun, NEWER
+        if order is not NEWER:
             self._began_s, self.found = None, {}
         if self.clock.is_settled:
             self.delays.add(now_s, delay_s * 1e6)
@@ -340,6 +346,9 @@ class Source:
     def _require_ns(self, setpoint: Setpoint, realtime_ns: int) -> None:
         """Raise MessageError if the stamp counts another unit."""
         stamp_ns = setpoint.stamp_ns
+        self._unit = ""
+        if abs(realtime_ns - stamp_ns) < FAR_S * 1e9:
+            return
         near = (unit for unit, factor in FACTORS.items() if abs(realtime_ns - stamp_ns * factor) < FAR_S * 1e9)
         self._unit = next(near, "")
         if self._unit:

@@ -14,7 +14,7 @@ from firmware_protocol.codec import PROTOCOL_VERSION, SCHEMA_HASH, DriveMode, Me
 from tormagd.config import Device
 from tormagd.ground.plain_values import Kinds, plain, restore
 from tormagd.hardware.backend import Backend, BackendError, Sent
-from tormagd.hardware.link import DeviceLink, LinkState
+from tormagd.hardware.link import RUNNING, DeviceLink, LinkState
 from tormagd.hardware.measurement import DeviceRequest, Measurement
 from tormagd_client.messages import ClockReport, LinkReport
 
@@ -74,7 +74,7 @@ class Connection:
         if link is None or backend is None:
             return self._cause
         heard = backend.stream.statistics
-        if link.state is LinkState.RUNNING:
+        if link.state is RUNNING:
             return link.missing(heard.refused)
         if link.state is not LinkState.UNANSWERED:
             return link.cause
@@ -86,7 +86,7 @@ class Connection:
 
     @property
     def remedy(self) -> str:
-        if self.state is LinkState.RUNNING:
+        if self.state is RUNNING:
             return self.cause and "wait a moment; if it stays, look at what the firmware sends, and at its CRC-8"
         return self._remedy or _REMEDIES.get(self.state, "")
 
@@ -97,7 +97,7 @@ class Connection:
 
     @property
     def measurement(self) -> Measurement | None:
-        return self._link.measurement if self._link is not None and self._link.state is LinkState.RUNNING else None
+        return self._link.measurement if self._link is not None and self._link.state is RUNNING else None
 
     @property
     def pending(self) -> DeviceRequest:
@@ -149,11 +149,11 @@ class Connection:
         if number != self._requested:
             self._requested = number
             # opening the gap waits for a device; no other request may move one that has come since
-            if request is DeviceRequest.RETRACT or link.state is LinkState.RUNNING:
+            if request is DeviceRequest.RETRACT or link.state is RUNNING:
                 link.request(now_s, request)
         sent: list[Sent] = []
         try:
-            if link.state is LinkState.RUNNING:
+            if link.state is RUNNING:
                 sent.append(_sent(backend, link.drive(left_duty, right_duty, mode)))
             sent += [_sent(backend, message) for message in link.due(now_s)]
         except BackendError as error:
@@ -239,10 +239,10 @@ class Connection:
         if state is before:
             return
         self._seen = state
-        if state is LinkState.RUNNING:
+        if state is RUNNING:
             self._back_off_s = FIRST_BACK_OFF_S
             log.info("the device on %s runs", self._device.port)
-        elif before is LinkState.RUNNING:
+        elif before is RUNNING:
             self.losses += 1
             self._last_loss = self.cause
             log.warning("the link to %s is lost: %s; next: %s", self._device.port, self.cause, self.remedy)

@@ -70,7 +70,7 @@ class LinkState(StrEnum):
 # looking a member up in its class takes longer than the rest of the work on a message
 _IDENTIFYING: Final = LinkState.IDENTIFYING
 _UNANSWERED: Final = LinkState.UNANSWERED
-_RUNNING: Final = LinkState.RUNNING
+RUNNING: Final = LinkState.RUNNING
 _NO_REQUEST: Final = DeviceRequest.NONE
 
 
@@ -160,7 +160,7 @@ class DeviceLink:
             if self._request is not DeviceRequest.RETRACT and now_s - self._requested_s > GIVE_UP_S:
                 self._request = _NO_REQUEST
             else:
-                is_waiting = self.state is _RUNNING and self._status is not None
+                is_waiting = self.state is RUNNING and self._status is not None
         messages: list[Message] = []
         if now_s >= self._hello_due_s and not is_waiting:
             self._hello_due_s = now_s + (REPEAT_S if self.state is _IDENTIFYING else HELLO_S)
@@ -182,7 +182,7 @@ class DeviceLink:
         self._request_due_s = self._requested_s = now_s
 
     def missing(self, refused: Mapping[str, str]) -> str:
-        if self.state is not _RUNNING or self._is_measured:
+        if self.state is not RUNNING or self._is_measured:
             return ""
         lacking: list[str] = []
         for name, message in (("State", self._state), ("Sense", self._sense), ("Status", self._status)):
@@ -202,7 +202,7 @@ class DeviceLink:
         # one tick later, so that the core has seen the measurement that shows the break, and names it better
         if self._broken:
             self._begin(now_s, self._broken)
-        elif self.state is _RUNNING and now_s - self._heard_s > SILENT_S:
+        elif self.state is RUNNING and now_s - self._heard_s > SILENT_S:
             self.state = LinkState.LOST
             self.cause = f"no message for {SILENT_S * 1e3:.0f} ms"
         elif self.state is _IDENTIFYING and now_s - self._asked_s > UNANSWERED_S:
