@@ -10,7 +10,7 @@ import os
 import time
 from collections import deque
 from collections.abc import Callable
-from typing import Any, Final
+from typing import Any
 
 import zmq
 
@@ -63,8 +63,6 @@ TOO_MUCH, NOT_ALLOWED, OFF_THE_LIST = "sent too much", "command not allowed", "k
 OBSERVED = frozenset({"status", "describe"})
 "What an observer may ask."
 OPERATOR = frozenset({"operate"})
-NOBLOCK: Final = zmq.NOBLOCK
-SRCFD: Final = zmq.SRCFD
 
 log = logging.getLogger(__name__)
 Answer = Callable[[Request], Any]
@@ -98,7 +96,7 @@ class Endpoint:
             raise
         self._setpoints.subscribe(b"")
         self._is_rest = False
-        "Whether the next part is of a message that was refused with its first."
+        "Whether a message refused with its first part goes on."
         for each in (self._setpoints, self._telemetry, self._recording, self._control):
             self.arrivals.watch(each)
         self.requests = Requests()
@@ -118,7 +116,7 @@ class Endpoint:
         for _ in range(DRAIN):
             if not self.arrivals.has(self._setpoints):
                 break
-            is_rest, frame = self._is_rest, self._setpoints.recv(NOBLOCK, copy=False)
+            is_rest, frame = self._is_rest, self._setpoints.recv(zmq.NOBLOCK, copy=False)
             self._is_rest = frame.more
             if is_rest:
                 continue
@@ -130,9 +128,8 @@ class Endpoint:
             elif peer.key and not self.admission.has_role(peer.key, MAY["setpoint"]):
                 self._drops.add("setpoint", peer, OFF_THE_LIST)
             else:
-                data = b"" if frame.more else frame.bytes
                 key = self.admission.allowed[peer.key].fingerprint if peer.key else ""
-                is_newer = self.inbox.take(data, now_s, realtime_ns, key) or is_newer
+                is_newer = self.inbox.take(b"" if frame.more else frame.bytes, now_s, realtime_ns, key) or is_newer
         return self.inbox.hand_on(time.monotonic()) or is_newer
 
     def publish(self, message: Telemetry | Motion | Verdict, *topic: bytes) -> None:
@@ -152,7 +149,7 @@ class Endpoint:
             until_ns, cut = time.monotonic_ns() + TAKEN_NS, set()
             with contextlib.suppress(zmq.Again):
                 while time.monotonic_ns() < until_ns:
-                    frame = subscribed.recv(NOBLOCK, copy=False)
+                    frame = subscribed.recv(zmq.NOBLOCK, copy=False)
                     peer: Peer | None = None  # where libzmq unsubscribes a peer that has gone
                     with contextlib.suppress(zmq.ZMQError):
                         peer, _ = self._sender(frame, name)
@@ -248,26 +245,26 @@ class Endpoint:
             raise OSError(f"endpoints.{name} = {address!r}: {error}") from error
 
     def _send(self, to: "zmq.Socket[bytes]", *parts: bytes) -> None:
-        to.send_multipart(parts, NOBLOCK)  # an XPUB drops what a slow subscriber has no room for
+        to.send_multipart(parts, zmq.NOBLOCK)  # an XPUB drops what a slow subscriber has no room for
         self.arrivals.touch(to)
 
     def _sender(self, frame: zmq.Frame, name: str) -> tuple[Peer, int]:
         """Return the peer that sent a message, with its key where the endpoint is guarded, and its connection."""
-        connection = int(frame.get(SRCFD))
+        connection = int(frame.get(zmq.SRCFD))
         self.admission.heard.add((name, connection))
         key = str(frame.get("User-Id")) if name in self._guarded else ""
         return Peer(str(frame.get("Peer-Address")), key), connection
 
     def _next_request(self) -> Waiting | None:
         """Read the next message; None for a further part of a message read before, which is dropped."""
-        client = b"" if self._control.rcvmore else self._control.recv(NOBLOCK)
-        part = self._control.recv(NOBLOCK, copy=False)
+        client = b"" if self._control.rcvmore else self._control.recv(zmq.NOBLOCK)
+        part = self._control.recv(zmq.NOBLOCK, copy=False)
         if not client or client in self._cut_off:
             return None
         hops: list[bytes] = []
         while part.more and hops[-1:] != [b""] and len(hops) < HOPS and len(part) <= LONGEST_ROUTING_ID:
             hops.append(part.bytes)
-            part = self._control.recv(NOBLOCK, copy=False)
+            part = self._control.recv(zmq.NOBLOCK, copy=False)
         envelope = hops if hops[-1:] == [b""] or all(map(_is_made, hops)) else None
         data = b"" if part.more or envelope is None else part.bytes
         return Waiting([client, *(envelope or ())], data, *self._sender(part, "control"), self.requests.opens)
@@ -327,7 +324,7 @@ class Endpoint:
     def _reply(self, waiting: Waiting, reply: Reply) -> None:
         """Send the reply to the client that asked; drop it where the client has gone."""
         self.arrivals.touch(self._control)
-        self._control.send_multipart([*waiting.envelope, encode(reply)], NOBLOCK)
+        self._control.send_multipart([*waiting.envelope, encode(reply)], zmq.NOBLOCK)
 
 
 def _is_made(routing_id: bytes) -> bool:

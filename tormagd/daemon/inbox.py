@@ -72,8 +72,7 @@ class SetpointInbox:
         self._other, self._other_s = "", -SILENT_S
         "The source last refused because another one holds the brake, and when."
         self._news: deque[str] = deque(maxlen=NEWS)
-        self._told_s = -NEWS_S
-        self._turn = 0
+        self._told_s, self._turn = -NEWS_S, 0
 
     def take(self, data: bytes, now_s: float, realtime_ns: int, key: str = "") -> bool:
         """Take one message; return True if another setpoint is in force after it."""
@@ -312,4 +311,4 @@ def _from_zero(setpoint: Setpoint) -> tuple[float, float | None, tuple[float, ..
     is_raised = min((setpoint.servo_cf, withdraw or 0.0, *preview_N)) < 0.0
     # 0.0 stands first: of 0.0 and -0.0, max takes the first
     servo_cf, withdraw_cf = max(0.0, setpoint.servo_cf), None if withdraw is None else max(0.0, withdraw)
-    return servo_cf, withdraw_cf, tuple(max(0.0, force_N) for force_N in preview_N), is_raised
+    return servo_cf, withdraw_cf, tuple([max(0.0, force_N) for force_N in preview_N]), is_raised

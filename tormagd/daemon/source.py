@@ -72,9 +72,7 @@ class Order(Enum):
     "Old, repeated, or from another run."
 
 
-# looking a member up takes longer than comparing it
 NEWER: Final = Order.NEWER
-NEW_RUN: Final = Order.NEW_RUN
 STRAY: Final = Order.STRAY
 
 
@@ -124,7 +122,7 @@ class Sequence:
         self.session, self.seq, self._step = session, seq, 0
         self._in_row = self._strays = self.missing = 0
         self.restarts += 1
-        return NEW_RUN
+        return Order.NEW_RUN
 
 
 @final
@@ -271,11 +269,9 @@ class Source:
         self.accepted = self.refused = self.raised = 0
         self.found: dict[Limit, Explanation] = {}
         self.cause = self.remedy = ""
-        self._is_named = False
-        self._begun = NEWER
-        self._unit = ""
+        self._is_named, self._begun = False, NEWER
+        self._unit, self._sent_s = "", 0.0
         self._began_s: float | None = None
-        self._sent_s = 0.0
         self._window: list[tuple[int, float, float]] = []
 
     def judge(self, setpoint: Setpoint, now_s: float, realtime_ns: int, playout_s: float, needs: Needs) -> Order:
@@ -346,10 +342,8 @@ class Source:
     def _require_ns(self, setpoint: Setpoint, realtime_ns: int) -> None:
         """Raise MessageError if the stamp counts another unit."""
         stamp_ns = setpoint.stamp_ns
-        self._unit = ""
-        if abs(realtime_ns - stamp_ns) < FAR_S * 1e9:
-            return
-        near = (unit for unit, factor in FACTORS.items() if abs(realtime_ns - stamp_ns * factor) < FAR_S * 1e9)
+        units = () if abs(realtime_ns - stamp_ns) < FAR_S * 1e9 else FACTORS.items()
+        near = (unit for unit, factor in units if abs(realtime_ns - stamp_ns * factor) < FAR_S * 1e9)
         self._unit = next(near, "")
         if self._unit:
             raise MessageError(

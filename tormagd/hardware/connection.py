@@ -112,8 +112,7 @@ class Connection:
             log.log(logging.WARNING if str(error) != self._cause else logging.DEBUG, "%s", error)
             self._wait(now_s, LinkState.BACK_OFF, str(error), error.remedy)
             return
-        self._remedy = ""
-        self._link = DeviceLink(now_s)
+        self._remedy, self._link = "", DeviceLink(now_s)
         if self._unfinished is DeviceRequest.RETRACT:
             self._link.request(now_s, self._unfinished)
         self._unfinished = DeviceRequest.NONE
@@ -170,8 +169,7 @@ class Connection:
 
     def close(self) -> None:
         self._release()
-        self._waiting, self._cause, self._remedy = LinkState.CLOSED, "closed", ""
-        self._seen = LinkState.CLOSED
+        self._waiting, self._cause, self._remedy, self._seen = LinkState.CLOSED, "closed", "", LinkState.CLOSED
 
     def memory(self) -> Any:
         """Return the conversation's state as plain data, from which `remember` continues it elsewhere."""

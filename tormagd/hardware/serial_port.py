@@ -13,8 +13,7 @@ from tormagd.hardware.backend import BackendError
 from tormagd.hardware.streams import FrameStream
 
 READ_BYTES: Final = 4_096
-NO_BYTES: Final = bytes(4)
-"How many wait, as the kernel's int."
+NOTHING_WAITS: Final = bytes(4)
 UNSENT_BYTES: Final = 512
 "Some frames may wait for the driver; more bytes mean that nobody reads at the other end."
 
@@ -32,7 +31,7 @@ class SerialPort:
     def receive(self) -> list[Message]:
         try:
             # `read` on an empty terminal waits for a kernel worker (flush_to_ldisc), up to 100 ms on a busy machine
-            if ioctl(self._fd, termios.FIONREAD, NO_BYTES) == NO_BYTES:
+            if ioctl(self._fd, termios.FIONREAD, NOTHING_WAITS) == NOTHING_WAITS:
                 return self.stream.unpack(b"")
             data = os.read(self._fd, READ_BYTES)
         except OSError as error:
