@@ -57,16 +57,20 @@ def test_readings_that_fall_further_are_followed_to_its_end_or_not_at_all_and_na
     assert {Limit.DEVICE_OR_SENSOR, Limit.SENSOR} & set(known.planned.limits)
 
 
-def test_readings_that_fade_are_followed_to_its_end_however_often_the_handle_turns(known, hear, moving) -> None:
+@pytest.mark.parametrize(("rate_mm_s", "less_N"), [(42.0, 0.0), (25.0, 0.02)], ids=["steady", "the model gives less"])
+def test_readings_that_fade_are_followed_to_its_end_however_often_the_handle_turns(
+    known, hear, moving, rate_mm_s: float, less_N: float
+) -> None:
     named_N = None
     for turn in range(12):
+        way = Turn(-1.0, 0.0, 100.0) if turn % 2 else Turn(1.0, 0.0, 100.0)
         for step in range(10):
             shown_N = MODEL_N * (1.0 - 0.002 * (10 * turn + step))
-            hear(known, 0.2, moving(force_N=shown_N, **(NEW_WAY if turn % 2 else {})))
+            hear(known, 0.2, moving(force_N=shown_N, handle=Handle(MOBILISED_MM, rate_mm_s, way, rate_mm_s)))
             if named_N is None and Limit.DEVICE_OR_SENSOR in known.planned.limits:
                 named_N = shown_N
     assert force_N(known.believe) == pytest.approx(END_N, abs=0.01)
-    assert named_N == pytest.approx(END_N - KNOWN_N, abs=0.01)
+    assert named_N == pytest.approx(END_N - KNOWN_N - less_N, abs=0.01)
 
 
 @pytest.mark.parametrize("seconds", [0.02, 0.1, 0.5])

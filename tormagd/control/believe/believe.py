@@ -96,8 +96,7 @@ class Believe:
 
     def __init__(self, config: Config, scene: Scene, nominal: Nominal, memory: ElementMemory) -> None:
         """Begin with an unseen device."""
-        self.memory = memory
-        self.learns = scene.terms.learning
+        self.memory, self.learns = memory, scene.terms.learning
         self._has_motor: Final = scene.terms.motor
         self._fits: Final = (scene.terms.scale, scene.terms.offset)
         self._trim: Final = config.trim

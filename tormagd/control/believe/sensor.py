@@ -16,6 +16,7 @@ from tormagd.control.believe.freshness import Freshness
 from tormagd.control.believe.sensor_zero import UNKNOWN_SD_N, VISCOUS_N_S_MM
 from tormagd.control.believe.strength import SURE, UNSEEN, Anchor, DeviceFit
 from tormagd.control.interpolation import low_pass
+from tormagd.control.nominal import ROLLER_RATE_MM_S
 from tormagd.element.model.force_curve import within
 
 Disputed = Literal["device", "sensor"]
@@ -28,7 +29,7 @@ LEARNS_S: Final = 0.5
 KNOWN_N: Final = 0.02
 "An anchor that is known so well at a force, as a standard deviation, learns no more there."
 SLACK_N: Final = 0.04
-"Noise, hysteresis, a creep and a kelvin move a force by so much."
+"Noise, hysteresis, a creep, a turn and a kelvin move a force by so much."
 FALLS_1_S: Final = 0.3
 "The leash gives way by this share of the anchor a second."
 NAMED_S: Final = 0.1
@@ -106,7 +107,7 @@ class SensorTrust:
         most_N = self._most * (1.0 + WEAKENED) * model_N + unsure_N
         is_strange = is_frozen or not least_N <= force_N + self.off_N <= most_N
         surely_N = SURE * max(deviation_N - 2.0 * KNOWN_N, 0.0)
-        unsure_N += SURE * VISCOUS_N_S_MM * abs(rate_mm_s - self.rate_mm_s)
+        unsure_N += SURE * VISCOUS_N_S_MM * max(abs(rate_mm_s - self.rate_mm_s) - ROLLER_RATE_MM_S, 0.0)
         beyond_N = abs(self.off_N) - self._leash * force_N - unsure_N - KNOWN_N - surely_N
         teaches = self._judge(is_strange, beyond_N <= 0.0, is_stale, dt_s)
         leapt_N = (1.0 - LEAPT) * force_N - unsure_N - surely_N if self.has_slid else least_N
