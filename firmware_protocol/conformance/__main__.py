@@ -119,9 +119,9 @@ def _examined(line: Line, checks: Sequence[Check], options: argparse.Namespace) 
         print(f"the line is gone ({error}): by the page the device opens the gap by itself now", file=sys.stderr)
         return False
     _say(f"{options.line}: {_summary(host, results)}", out)
-    if options.json:
-        _say(json.dumps(report(results), indent=2), sys.stdout)
-    return all(result.passed is not False for result in results)
+    return (not options.json or _say(json.dumps(report(results), indent=2), sys.stdout)) and all(
+        result.passed is not False for result in results
+    )
 
 
 def _summary(host: Host, results: Sequence[Result]) -> str:
@@ -141,9 +141,11 @@ def _reset(command: str, how: str) -> None:
         raise Unmet(f"--reset: {error}") from error
 
 
-def _say(text: str, out: TextIO) -> None:
+def _say(text: str, out: TextIO) -> bool:
     with contextlib.suppress(OSError):
         print(text, file=out, flush=True)
+        return True
+    return False
 
 
 def _is_agreed(line: str) -> bool:

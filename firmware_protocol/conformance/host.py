@@ -99,7 +99,7 @@ class Host:
         opening_mm_s: float = OPENING_MM_S,
         stroke_mm: float = STROKE_MM,
         reset: Callable[[str], None] | None = None,
-        ask: Callable[[str], None] = lambda what: None,
+        ask: Callable[[str], object] = lambda what: None,
     ) -> None:
         self.line = line
         self.opening_mm_s = opening_mm_s

@@ -1448,14 +1448,17 @@ def test_a_line_that_goes_is_told_and_no_success(ran: Callable[..., int], capsys
     assert "the line is gone" in capsys.readouterr().err
 
 
-def test_a_reader_that_goes_does_not_end_the_run(monkeypatch: pytest.MonkeyPatch, ran: Callable[..., int]) -> None:
+@pytest.mark.parametrize(("options", "code"), [((), 0), (("--json",), 1)], ids=["text", "the report is lost"])
+def test_a_reader_that_goes_does_not_end_the_run(
+    monkeypatch: pytest.MonkeyPatch, ran: Callable[..., int], options: tuple[str, ...], code: int
+) -> None:
     class Closed(io.StringIO):
         def write(self, text: str) -> int:
             raise BrokenPipeError
 
     device = VirtualDevice(NEAR_HOME, SteadyHand())
     monkeypatch.setattr(sys, "stdout", Closed())
-    assert ran(SerialLine(Wire(device)), "--yes", "--only", "run_drive_off") == 0
+    assert ran(SerialLine(Wire(device)), "--yes", "--only", "run_drive_off", *options) == code
     assert device.messages.firmware.mode is DeviceMode.IDLE
 
 
