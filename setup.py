@@ -1,7 +1,7 @@
 """Compiles the core where a compiler and Python's headers are.
 
 mypyc compiles the very `.py` that people read. Where that cannot be, they run as they are, with the same results to the
-bit and a fifth of the speed; `firmware_protocol/build.py` says which. With TORMAG_COMPILE=require, failure to compile
+bit and a tenth of the speed; `firmware_protocol/build.py` says which. With TORMAG_COMPILE=require, failure to compile
 is an error; with TORMAG_COMPILE=skip, compiling is not tried.
 """
 

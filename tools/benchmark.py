@@ -15,8 +15,7 @@ MEASUREMENTS = {
     "inverse": "speed against accuracy of the searches for the field",
     "loop": "lateness of the control loop beside a bare timer",
     "latency": "from a setpoint to the first drive frame that reflects it",
-    "step": "how fast and how exactly the gap follows, in virtual time",
-    "virtual-time": "how much faster than real time that is",
+    "step": "how fast and how exactly the gap follows, in virtual time, and how fast that runs",
 }
 
 

@@ -1,18 +1,16 @@
 """The subcommands of `benchmark`: their keys, their arithmetic, figures of no machine in particular."""
 
 import argparse
-import json
 import math
 import os
 import subprocess
 import time
 from pathlib import Path
 
-import benchmark
 import msgspec
 import numpy as np
 import pytest
-from benchmarks import inverse, latency, loop, step, virtual_time
+from benchmarks import inverse, latency, loop, step
 
 from tormag_lab.told import lines
 from tormagd.commission.gains import MIN_GAIN_MARGIN_DB, MIN_PHASE_MARGIN_DEG
@@ -185,16 +183,6 @@ def test_stages_add_up_to_the_whole() -> None:
     whole_us = result["setpoint_to_wire_us"]
     assert (whole_us["p50"], whole_us["max"], result["ratio"]) == pytest.approx((765.0, 960.0, 6.95), abs=0.01)
     assert (result["setpoints"], result["seen"], len(result["stages_us"])) == (3, 2, 2)
-
-
-def test_virtual_time_is_measured(capsys: pytest.CaptureFixture[str]) -> None:
-    assert benchmark.main(["virtual-time", "--seconds", "0.2", "--json"]) == 0
-    found = json.loads(capsys.readouterr().out)["interpreted"]
-    assert found.keys() == virtual_time.LOOPS.keys()
-    assert min(found.values()) > 0.0
-    stretches = {"interpreted": {"whole_core": [90.0, 200.0, 900.0], "position_loop": [125.0]}}
-    factors = {"whole_core": 5.0, "position_loop": 8.0}
-    assert virtual_time.summary(stretches, 1e3) == {"compiled": None, "interpreted": factors}
 
 
 def test_a_result_is_told_by_lines_and_tables() -> None:

@@ -151,6 +151,14 @@ class Admission:
                 return number > 0
         return True
 
+    def leave(self, name: str) -> None:
+        """Forget the endpoint `name`, whose socket is about to be closed, and its connections."""
+        known = self._endpoints.pop(name)
+        self._arrivals.leave(known.monitor)
+        self._parts = [each for each in self._parts if each[0] is not known.monitor]
+        self.heard = {each for each in self.heard if each[0] != name}
+        known.endpoint.disable_monitor()
+
     def close(self) -> None:
         """Stop watching the connections."""
         for known in self._endpoints.values():

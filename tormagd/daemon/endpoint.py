@@ -59,7 +59,11 @@ FIRSTS_PER_S, FIRST_BURST = 100.0, 100.0
 "How often a peer may say `stop` or `disable`. With one more, which is carried out, its connection is cut off."
 ANSWERS_NS = 150_000
 "For how long requests are answered in one beat; one that has begun is ended."
+PARTS_NS, MANY_PORTIONS = 400_000, 50
+"For how long a message's further parts are read and dropped in one beat, some three hundred, and in how many beats."
 TOO_MUCH, NOT_ALLOWED, OFF_THE_LIST = "sent too much", "command not allowed", "key taken off the list"
+MANY_PARTS = "a message of thousands of parts"
+LEAVES_MS = 20
 OBSERVED = frozenset({"status", "describe"})
 "What an observer may ask."
 OPERATOR = frozenset({"operate"})
@@ -85,20 +89,20 @@ class Endpoint:
         self.inbox = SetpointInbox(sources)
         self.arrivals = Arrivals()
         self.admission = Admission(self._context, keys, self.arrivals)
+        self._addresses = {name: getattr(endpoints, name) for name in ENDPOINTS}
+        self._unread: dict[str, zmq.Frame] = {}
+        "The newest part of an endpoint's newest message."
+        self._portions = dict.fromkeys(ENDPOINTS, 0)
+        "In how many beats in a row that was read on."
         try:
-            self._setpoints = self._bind(zmq.SUB, "setpoint", endpoints.setpoint)
+            self._setpoints = self._bind(zmq.SUB, "setpoint")
             # XPUB is a PUB that tells what its subscribers say
-            self._telemetry = self._bind(zmq.XPUB, "telemetry", endpoints.telemetry)
-            self._recording = self._bind(zmq.XPUB, "recording", endpoints.recording)
-            self._control = self._bind(zmq.ROUTER, "control", endpoints.control)
+            self._telemetry = self._bind(zmq.XPUB, "telemetry")
+            self._recording = self._bind(zmq.XPUB, "recording")
+            self._control = self._bind(zmq.ROUTER, "control")
         except OSError:
             self.close()
             raise
-        self._setpoints.subscribe(b"")
-        self._is_rest = False
-        "Whether a message refused with its first part goes on."
-        for each in (self._setpoints, self._telemetry, self._recording, self._control):
-            self.arrivals.watch(each)
         self.requests = Requests()
         self._cut_off: deque[bytes] = deque(maxlen=CONNECTIONS)
         self._firsts = Allowance(FIRSTS_PER_S, FIRST_BURST)
@@ -114,12 +118,9 @@ class Endpoint:
         force."""
         is_newer = False
         for _ in range(DRAIN):
-            if not self.arrivals.has(self._setpoints):
+            if not (self._is_whole(self._setpoints, "setpoint") and self.arrivals.has(self._setpoints)):
                 break
-            is_rest, frame = self._is_rest, self._setpoints.recv(zmq.NOBLOCK, copy=False)
-            self._is_rest = frame.more
-            if is_rest:
-                continue
+            frame = self._unread["setpoint"] = self._setpoints.recv(zmq.NOBLOCK, copy=False)
             # both clocks at once, for each message: their difference shows which was set, and the loop may be held up
             now_s, realtime_ns = time.monotonic(), time.time_ns()
             peer, _ = self._sender(frame, "setpoint")
@@ -165,7 +166,7 @@ class Endpoint:
         """Take waiting requests from the socket, TAKEN at most, for TAKEN_NS; answer `stop` and `disable` at once."""
         until_ns = time.monotonic_ns() + TAKEN_NS
         for _ in range(TAKEN):
-            if not self.arrivals.has(self._control):
+            if time.monotonic_ns() > until_ns or not self.arrivals.has(self._control):
                 return
             waiting = self._next_request()
             if waiting is None:
@@ -178,8 +179,6 @@ class Endpoint:
                     self._cut_off.append(waiting.envelope[0])
             if is_dropped:
                 self._drops.add("control", waiting.peer, TOO_MUCH)
-            if time.monotonic_ns() >= until_ns:
-                return
 
     def serve(self, answer: Answer, most: int) -> int:
         """Answer the waiting requests, `most` at most, for about ANSWERS_NS; return the number answered."""
@@ -220,13 +219,16 @@ class Endpoint:
             file.close()
         self._context.destroy(linger=0)
 
-    def _bind(self, kind: int, name: str, address: str) -> "zmq.Socket[bytes]":
+    def _bind(self, kind: int, name: str) -> "zmq.Socket[bytes]":
         """Return a new socket of this `kind`, guarded where `endpoints` says so, bound, with bounded queues."""
         made = self._context.socket(kind)
         for option, value in ({zmq.LINGER: 0, zmq.BACKLOG: 512} | OPTIONS[kind]).items():
             made.setsockopt(option, value)
         self.admission.guard(made, name, name in self._guarded)
-        self._listen(made, name, address)
+        if kind == zmq.SUB:
+            made.subscribe(b"")
+        self._listen(made, name, self._addresses[name])
+        self.arrivals.watch(made)
         return made
 
     def _listen(self, made: "zmq.Socket[bytes]", name: str, address: str) -> None:
@@ -237,7 +239,7 @@ class Endpoint:
                 file = SocketFile(path)
                 self._files.append((file, made, name, address))
                 made.setsockopt(zmq.USE_FD, file.listener.detach())
-            made.bind(address)
+            _occupy(made, address)
             self.admission.update()
         except zmq.ZMQError as error:
             raise OSError(f"endpoints.{name} = {address!r}: cannot be bound: {error.strerror}; name another") from error
@@ -248,6 +250,37 @@ class Endpoint:
         to.send_multipart(parts, zmq.NOBLOCK)  # an XPUB drops what a slow subscriber has no room for
         self.arrivals.touch(to)
 
+    def _is_whole(self, socket: "zmq.Socket[bytes]", name: str) -> bool:
+        """Read on to the end of the newest message, for PARTS_NS; return whether that is reached. One that is not over
+        after MANY_PORTIONS goes with its socket."""
+        frame, until_ns = self._unread.pop(name, None), time.monotonic_ns() + PARTS_NS
+        while frame is not None and frame.more:
+            if time.monotonic_ns() > until_ns:
+                self._unread[name] = frame
+                self._portions[name] += 1
+                if self._portions[name] >= MANY_PORTIONS:
+                    self._drops.add(name, self._sender(frame, name)[0], MANY_PARTS)
+                    self._renew(socket, name)
+                return False
+            frame = socket.recv(zmq.NOBLOCK, copy=False)
+        self._portions[name] = 0
+        return True
+
+    def _renew(self, old: "zmq.Socket[bytes]", name: str) -> None:
+        """Bind a new socket in the place of `old`, whose connections end and whose messages are lost."""
+        del self._unread[name]
+        self._portions[name] = 0
+        self.admission.leave(name)
+        self.arrivals.leave(old)
+        for each in [each for each in self._files if each[1] is old]:
+            self._files.remove(each)
+            each[0].close()
+        old.close(0)
+        if name == "control":
+            self._control = self._bind(zmq.ROUTER, name)
+        else:
+            self._setpoints = self._bind(zmq.SUB, name)
+
     def _sender(self, frame: zmq.Frame, name: str) -> tuple[Peer, int]:
         """Return the peer that sent a message, with its key where the endpoint is guarded, and its connection."""
         connection = int(frame.get(zmq.SRCFD))
@@ -256,15 +289,17 @@ class Endpoint:
         return Peer(str(frame.get("Peer-Address")), key), connection
 
     def _next_request(self) -> Waiting | None:
-        """Read the next message; None for a further part of a message read before, which is dropped."""
-        client = b"" if self._control.rcvmore else self._control.recv(zmq.NOBLOCK)
-        part = self._control.recv(zmq.NOBLOCK, copy=False)
-        if not client or client in self._cut_off:
+        """Read the next message; None for further parts of the one before, which are dropped."""
+        if not self._is_whole(self._control, "control") or not self.arrivals.has(self._control):
+            return None
+        client = self._control.recv(zmq.NOBLOCK)
+        part = self._unread["control"] = self._control.recv(zmq.NOBLOCK, copy=False)
+        if client in self._cut_off:
             return None
         hops: list[bytes] = []
         while part.more and hops[-1:] != [b""] and len(hops) < HOPS and len(part) <= LONGEST_ROUTING_ID:
             hops.append(part.bytes)
-            part = self._control.recv(zmq.NOBLOCK, copy=False)
+            part = self._unread["control"] = self._control.recv(zmq.NOBLOCK, copy=False)
         envelope = hops if hops[-1:] == [b""] or all(map(_is_made, hops)) else None
         data = b"" if part.more or envelope is None else part.bytes
         return Waiting([client, *(envelope or ())], data, *self._sender(part, "control"), self.requests.opens)
@@ -325,6 +360,16 @@ class Endpoint:
         """Send the reply to the client that asked; drop it where the client has gone."""
         self.arrivals.touch(self._control)
         self._control.send_multipart([*waiting.envelope, encode(reply)], zmq.NOBLOCK)
+
+
+def _occupy(made: "zmq.Socket[bytes]", address: str) -> None:
+    """Bind a socket; one that had the address before may leave it up to LEAVES_MS later."""
+    for _ in range(LEAVES_MS):
+        with contextlib.suppress(zmq.ZMQError):
+            made.bind(address)
+            return
+        time.sleep(1e-3)
+    made.bind(address)
 
 
 def _is_made(routing_id: bytes) -> bool:

@@ -191,6 +191,12 @@ class Arrivals:
         self._sockets[descriptor] = socket
         self._poll.register(descriptor, select.POLLIN)
 
+    def leave(self, socket: "zmq.Socket[bytes]") -> None:
+        descriptor = int(socket.fileno())
+        self._ready.discard(socket)
+        self._poll.unregister(descriptor)
+        del self._sockets[descriptor]
+
     def look(self) -> None:
         for descriptor, _ in self._poll.poll(0):
             self._ready.add(self._sockets[descriptor])
