@@ -77,7 +77,8 @@ class Governor:
         self._has_forecast: Final = terms.forecast
         self._portrait: Final = portrait
         self._speeds: Final = speeds
-        self._release_N_s, self._least_N, self._decays = force.release_N_s, force.least_N, force.breakthrough == "decay"
+        self._force: Final = force
+        self._release_N_s: Final = force.release_N_s
         self._allowed: Final = (force.waiting_N, force.most_N)
         self.forecast = Forecast()
         self.begin(now_s)
@@ -164,8 +165,8 @@ class Governor:
         """Return what holds the force that is asked for now."""
         waiting_N, most_N = self._allowed
         return (
-            ((Limit.RANGE,) if not self._least_N <= asked_N <= most_N else ())
-            + ((Limit.STANDBY,) if self._least_N < waiting_N > asked_N else ())
+            ((Limit.RANGE,) if not self._force.least_N <= asked_N <= most_N else ())
+            + ((Limit.STANDBY,) if self._force.least_N < waiting_N > asked_N else ())
             + ((Limit.F_MIN,) if lawful_N < given[0] else ())
             + ((Limit.F_MAX,) if lawful_N > given[1] else ())
             + setpoint.limits
@@ -181,7 +182,7 @@ class Governor:
             rises_N = falls_N = step_N
             if wall is not None:
                 rises_N = falls_N = step_N + wall.stiffness_N_mm * abs(travel.place_mm - self.target_mm)
-            elif self._decays:
+            elif self._force.breakthrough == "decay":
                 rises_N, falls_N = ENDLESS, DECAY * step_N
             elif last.wall is None and before_N == within(last.force_N, self._allowed):
                 rises_N = falls_N = ENDLESS

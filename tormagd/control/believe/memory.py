@@ -42,8 +42,9 @@ class ElementMemory:
 
     def __init__(self, memory: Memory, nominal: Nominal, field: FieldOfGap, gap_range_mm: tuple[float, float]) -> None:
         """Begin before the first known gap."""
-        self._free, self._added = memory.free, memory.added
-        self._width_mT, self._turn_mT = memory.lag_mT, memory.turn_mT
+        self._free: Final = memory.free
+        self._added: Final = memory.added
+        self._hysteresis_mT: Final = (memory.lag_mT, memory.turn_mT)
         self._nominal: Final = nominal
         self._slides: Final = nominal.contact.slides
         self._field: Final = field
@@ -61,8 +62,8 @@ class ElementMemory:
         change_mT = field_mT - self.field_mT
         if change_mT == 0.0 or self.time_s == math.inf:
             return self.lag_mT
-        side_mT = math.copysign(self._width_mT, change_mT)
-        return side_mT + (self.lag_mT - side_mT) * math.exp(-abs(change_mT) / self._turn_mT)
+        side_mT = math.copysign(self._hysteresis_mT[0], change_mT)
+        return side_mT + (self.lag_mT - side_mT) * math.exp(-abs(change_mT) / self._hysteresis_mT[1])
 
     def open_N(self) -> float:
         """Return the model's force, N, once the gap has gone straight open, less nothing that has relaxed."""
@@ -90,8 +91,7 @@ class ElementMemory:
         """Begin relaxed at the gap at which a brake was switched on, and with nothing relaxed on a pad."""
         found_mm = gap_mm - self.opened_mm
         is_known = self._least_mm <= found_mm <= self._open_mm + BEYOND_MM
-        self.field_mT = self._field.field_mT(found_mm if is_known else gap_mm)
-        self.time_s = now_s
+        self.field_mT, self.time_s = self._field.field_mT(found_mm if is_known else gap_mm), now_s
         self.free = self._free.relaxed(free_N if self._slides else 0.0)
         self.added = self._added.relaxed(self._force_N(curve, self.field_mT) - free_N if self._slides else 0.0)
 

@@ -70,7 +70,8 @@ class SensorTrust:
     "How long they have been such as no device gives; falls while they are not."
 
     def __init__(self, trim: Trim, known: DeviceFit = UNSEEN) -> None:
-        self._least, self._most, self._leash = trim.least, trim.most, trim.leash
+        self._scales: Final = (trim.least, trim.most)
+        self._leash: Final = trim.leash
         self.freshness = Freshness()
         self.anchor = Anchor(known)
 
@@ -103,8 +104,8 @@ class SensorTrust:
         force_N, deviation_N = max(self.anchor.force_N(model_N), 0.0), self.anchor.deviation_N(model_N)
         self.off_N = low_pass(self.off_N, reading_N - force_N, dt_s, FILTER_S)
         unsure_N = SLACK_N + SURE * max(zero_sd_N - UNKNOWN_SD_N, 0.0)
-        least_N = self._least * (1.0 - WEAKENED) * model_N - unsure_N
-        most_N = self._most * (1.0 + WEAKENED) * model_N + unsure_N
+        least_N = self._scales[0] * (1.0 - WEAKENED) * model_N - unsure_N
+        most_N = self._scales[1] * (1.0 + WEAKENED) * model_N + unsure_N
         is_strange = is_frozen or not least_N <= force_N + self.off_N <= most_N
         surely_N = SURE * max(deviation_N - 2.0 * KNOWN_N, 0.0)
         unsure_N += SURE * VISCOUS_N_S_MM * max(abs(rate_mm_s - self.rate_mm_s) - ROLLER_RATE_MM_S, 0.0)
@@ -135,7 +136,7 @@ class SensorTrust:
             self.below_s = within(self.below_s + (dt_s if self.off_N < 0.0 else -dt_s), (0.0, 2.0 * LEARNS_S))
         # a fall where it is known teaches nothing lower where it is half known
         if deviation_N <= (2.0 * KNOWN_N if self.below_s > LEARNS_S and self.off_N < 0.0 else KNOWN_N):
-            self.fallen = within(believed, (self._least, 1.0))
+            self.fallen = within(believed, (self._scales[0], 1.0))
         else:
             self.rate_mm_s = low_pass(self.rate_mm_s, rate_mm_s, dt_s, LEARNS_S)
             if self.has_slid:

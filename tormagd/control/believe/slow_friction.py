@@ -43,7 +43,7 @@ class SlowFriction:
     "e(v) where it was learned, by the same low pass; 1, as at rest, until then."
 
     def __init__(self, bounds: Trim) -> None:
-        self._least, self._factors = bounds.least, factor_bounds(bounds)
+        self._factors: Final = factor_bounds(bounds)
 
     def factor_at(self, rate_mm_s: float) -> float:
         """Return the factor on the force of a handle that slides at `rate_mm_s` >= 0: 1 at speed, k at rest."""
@@ -59,14 +59,13 @@ class SlowFriction:
 
     def update(self, fit: DeviceFit, model_N: float, rate_mm_s: float, reading_N: float, dt_s: float) -> None:
         """Learn k from one reading at a creep of `rate_mm_s`, which stands for `dt_s`."""
-        if reading_N < self._least * (1.0 - MAX_RELAXED) * model_N - NOISE_N:
+        if reading_N < self._factors[0] / MIN_STATIC * (1.0 - MAX_RELAXED) * model_N - NOISE_N:
             return
         slowness = _slowness(rate_mm_s)
         share = slowness * dt_s / (LEARNED_S + dt_s)
         shown = 1.0 + (reading_N / fit.force_N(model_N) - 1.0) / slowness
         unsure = BELIEVED_SD * fit.deviation_N(model_N) / fit.force_N(model_N)
-        least, most = self._factors
-        believed = max(MIN_STATIC - unsure, least), min(MAX_STATIC + unsure, most)
+        believed = max(MIN_STATIC - unsure, self._factors[0]), min(MAX_STATIC + unsure, self._factors[1])
         self.factor = within(self.factor + share * (shown - self.factor), believed)
         self.learned += share * (1.0 - self.learned)
         self.slowness += share * (slowness - self.slowness)
