@@ -16,7 +16,7 @@ from served import NAMES, PATIENCE_S, Served, command, free_ports, setpoint
 from tormagd.config import Config, Sources
 from tormagd.daemon import admission
 from tormagd.daemon.admission import AT_ONCE, PLAIN
-from tormagd.daemon.endpoint import Endpoint
+from tormagd.daemon.endpoint import MANY_PARTS, Endpoint
 from tormagd.ground.access_keys import KeyRing
 from tormagd_client.endpoints import Curve, Endpoints
 from tormagd_client.keys import KeyPair, fingerprint, generate, load_pair
@@ -305,3 +305,22 @@ def test_a_descriptor_that_is_no_connection_any_more_stays_as_it_is() -> None:
         assert admission._address(other.fileno()) == ""
         admission._end(other.fileno(), "")
         assert sorted(Path("/proc/self/fd").iterdir()) == before
+
+
+@pytest.mark.parametrize(("name", "who"), [("control", "viewer"), ("setpoint", "robot")])
+def test_a_message_in_thousands_of_parts_ends_in_time_and_its_sender_is_named(rig: Rig, name: str, who: str) -> None:
+    def publisher() -> "zmq.Socket[bytes]":
+        made = rig.peer(zmq.XPUB, "setpoint", rig.pair("robot"))
+        rig.until(lambda: made.poll(0) and made.recv())
+        return made
+
+    sender = publisher() if name == "setpoint" else rig.peer(zmq.DEALER, name, rig.pair(who))
+    sender.send_multipart([b"x"] * 60_000)
+    rig.until(lambda: rig.endpoint.report().dropped == 1)
+    (drop,) = rig.endpoint.report().drops
+    assert (drop.endpoint, drop.reason, drop.key) == (name, MANY_PARTS, f"{fingerprint(rig.pair(who).public)} ({who})")
+    console = rig.peer(zmq.DEALER, "control", rig.pair("console"))
+    console.send(command("stop"))
+    assert rig.reply(console).ok
+    publisher().send(setpoint(1))
+    rig.until(lambda: rig.endpoint.inbox.accepted == 1)

@@ -20,7 +20,7 @@ from sent import telemetry
 from served import MOST, NAMES, Served, command, setpoint
 
 from tormagd.control.safety.operating_state import RefusedError
-from tormagd.daemon.endpoint import DRAIN, FIRST_BURST, MANY_PARTS, SETPOINT_BURST, Endpoint
+from tormagd.daemon.endpoint import DRAIN, FIRST_BURST, SETPOINT_BURST, Endpoint
 from tormagd.daemon.peers import (
     LISTENERS,
     PEERS,
@@ -333,19 +333,6 @@ def test_a_message_in_countless_parts_is_read_in_portions_and_answered_once(rig:
     publisher.send(setpoint(2, 1.5))
     rig.until(lambda: rig.endpoint.inbox.accepted == 1)
     assert rig.endpoint.inbox.refused == 1
-
-
-@pytest.mark.parametrize("name", ["control", "setpoint"])
-def test_a_message_in_thousands_of_parts_ends_in_time_and_its_sender_is_cut_off(rig: Rig, name: str) -> None:
-    sender = rig.publisher() if name == "setpoint" else rig.connect(zmq.DEALER, name)
-    sender.send_multipart([b"x"] * 100_000)
-    rig.until(lambda: rig.endpoint.report().dropped == 1)
-    assert rig.drops() == [(name, OURSELVES, "", MANY_PARTS)]
-    operator, publisher = rig.connect(zmq.DEALER, "control"), rig.publisher()
-    operator.send(command("stop"))
-    assert rig.take_until(lambda: operator.poll(0) > 0) == ["stop"]
-    publisher.send(setpoint(1))
-    rig.until(lambda: rig.endpoint.inbox.accepted == 1)
 
 
 # -- floods --------------------------------------------------------------------------------------------------------
