@@ -1,12 +1,14 @@
 """The subcommands of `benchmark`: their keys, their arithmetic, figures of no machine in particular."""
 
 import argparse
+import json
 import math
 import os
 import subprocess
 import time
 from pathlib import Path
 
+import benchmark
 import msgspec
 import numpy as np
 import pytest
@@ -183,6 +185,12 @@ def test_stages_add_up_to_the_whole() -> None:
     whole_us = result["setpoint_to_wire_us"]
     assert (whole_us["p50"], whole_us["max"], result["ratio"]) == pytest.approx((765.0, 960.0, 6.95), abs=0.01)
     assert (result["setpoints"], result["seen"], len(result["stages_us"])) == (3, 2, 2)
+
+
+def test_a_measurement_is_one_object_and_says_how_fast_the_machine_was(capsys: pytest.CaptureFixture[str]) -> None:
+    assert benchmark.main(["step", "--json"]) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert min(found["virtual_time_factor"], found["machine_us"]) > 0.0
 
 
 def test_a_result_is_told_by_lines_and_tables() -> None:

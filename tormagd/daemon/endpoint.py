@@ -118,7 +118,7 @@ class Endpoint:
         force."""
         is_newer = False
         for _ in range(DRAIN):
-            if not (self._is_whole(self._setpoints, "setpoint") and self.arrivals.has(self._setpoints)):
+            if not self._has_message(self._setpoints, "setpoint"):
                 break
             frame = self._unread["setpoint"] = self._setpoints.recv(zmq.NOBLOCK, copy=False)
             # both clocks at once, for each message: their difference shows which was set, and the loop may be held up
@@ -166,7 +166,7 @@ class Endpoint:
         """Take waiting requests from the socket, TAKEN at most, for TAKEN_NS; answer `stop` and `disable` at once."""
         until_ns = time.monotonic_ns() + TAKEN_NS
         for _ in range(TAKEN):
-            if time.monotonic_ns() > until_ns or not self.arrivals.has(self._control):
+            if time.monotonic_ns() > until_ns or not self._has_message(self._control, "control"):
                 return
             waiting = self._next_request()
             if waiting is None:
@@ -250,8 +250,8 @@ class Endpoint:
         to.send_multipart(parts, zmq.NOBLOCK)  # an XPUB drops what a slow subscriber has no room for
         self.arrivals.touch(to)
 
-    def _is_whole(self, socket: "zmq.Socket[bytes]", name: str) -> bool:
-        """Read on to the end of the newest message, for PARTS_NS; return whether that is reached. One that is not over
+    def _has_message(self, socket: "zmq.Socket[bytes]", name: str) -> bool:
+        """Read on to the end of the newest message, for PARTS_NS; return whether another waits. One that is not over
         after MANY_PORTIONS goes with its socket."""
         frame, until_ns = self._unread.pop(name, None), time.monotonic_ns() + PARTS_NS
         while frame is not None and frame.more:
@@ -264,7 +264,7 @@ class Endpoint:
                 return False
             frame = socket.recv(zmq.NOBLOCK, copy=False)
         self._portions[name] = 0
-        return True
+        return self.arrivals.has(socket)
 
     def _renew(self, old: "zmq.Socket[bytes]", name: str) -> None:
         """Bind a new socket in the place of `old`, whose connections end and whose messages are lost."""
@@ -289,9 +289,7 @@ class Endpoint:
         return Peer(str(frame.get("Peer-Address")), key), connection
 
     def _next_request(self) -> Waiting | None:
-        """Read the next message; None for further parts of the one before, which are dropped."""
-        if not self._is_whole(self._control, "control") or not self.arrivals.has(self._control):
-            return None
+        """Read the message that waits; None if its client was cut off."""
         client = self._control.recv(zmq.NOBLOCK)
         part = self._unread["control"] = self._control.recv(zmq.NOBLOCK, copy=False)
         if client in self._cut_off:

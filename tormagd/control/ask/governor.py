@@ -78,7 +78,6 @@ class Governor:
         self._portrait: Final = portrait
         self._speeds: Final = speeds
         self._force: Final = force
-        self._release_N_s: Final = force.release_N_s
         self._allowed: Final = (force.waiting_N, force.most_N)
         self.forecast = Forecast()
         self.begin(now_s)
@@ -108,20 +107,19 @@ class Governor:
         if held_N is not None:
             self.is_passing, dt_s = True, 0.0
             self._stand_at(held_N, device)
+        age_s: float | None = None
         if setpoint is not None:
+            age_s = now_s - setpoint.stamp_s
             setpoint.require_numbers()
             is_new = self.last is None or setpoint.stamp_s != self.last.stamp_s
             self.silent_s = 0.0 if is_new else self.silent_s + dt_s
-            if now_s - setpoint.stamp_s <= setpoint.valid_for_s:
-                return self._followed(
-                    setpoint, now_s - setpoint.stamp_s, device, lag_s, travel, dt_s, given, held_N is None
-                )
+            if age_s <= setpoint.valid_for_s:
+                return self._followed(setpoint, age_s, device, lag_s, travel, dt_s, given, held_N is None)
         # where a device turns out weaker, the gap does not close for it
         left_N = min(self.asked_N, device.force_N(self._portrait.force_N_at(self.from_mm)))
-        self._stand_at(max(left_N - self._release_N_s * dt_s, given[0]), device)
+        self._stand_at(max(left_N - self._force.release_N_s * dt_s, given[0]), device)
         self._forget()
         limits = (Limit.NO_SETPOINT,) if setpoint is None else (Limit.STALE, *setpoint.limits)
-        age_s = None if setpoint is None else now_s - setpoint.stamp_s
         return Ask(self.asked_N, [self.asked_N] * len(PATH_S), age_s, limits)
 
     def _followed(
@@ -135,7 +133,7 @@ class Governor:
         given: tuple[float, float],
         is_free: bool,
     ) -> Ask:
-        asked_N, step_N = setpoint.asked_N(travel), self._release_N_s * dt_s
+        asked_N, step_N = setpoint.asked_N(travel), self._force.release_N_s * dt_s
         allowed_N = within(asked_N, self._allowed)
         lawful_N = self._lawful_N(setpoint, travel, allowed_N, step_N)
         blend_N, force_N = lawful_N - allowed_N, within(lawful_N, given)
