@@ -176,7 +176,7 @@ def may_go_first(data: bytes) -> bool:
     return any(sign in data for sign in _SIGNS)
 
 
-_EVENTS, _POLLIN = int(zmq.EVENTS), int(zmq.POLLIN)
+_POLLIN = int(zmq.POLLIN)
 
 
 class Arrivals:
@@ -206,6 +206,6 @@ class Arrivals:
         self._ready.add(socket)
 
     def has(self, socket: "zmq.Socket[bytes]") -> bool:
-        if socket in self._ready and not int(socket.get(_EVENTS)) & _POLLIN:
+        if socket in self._ready and not zmq.zmq_poll([(socket, _POLLIN)], 0):
             self._ready.discard(socket)
         return socket in self._ready

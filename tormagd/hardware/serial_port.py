@@ -13,7 +13,6 @@ from tormagd.hardware.backend import BackendError
 from tormagd.hardware.streams import FrameStream
 
 READ_BYTES: Final = 4_096
-NOTHING_WAITS: Final = bytes(4)
 UNSENT_BYTES: Final = 512
 "Some frames may wait for the driver; more bytes mean that nobody reads at the other end."
 
@@ -27,13 +26,13 @@ class SerialPort:
         self._fd: int = port.fileno()
         self.stream = FrameStream()
         self._unsent = b""
+        self._waiting = bytearray(4)
 
     def receive(self) -> list[Message]:
         try:
             # `read` on an empty terminal waits for a kernel worker (flush_to_ldisc), up to 100 ms on a busy machine
-            if ioctl(self._fd, termios.FIONREAD, NOTHING_WAITS) == NOTHING_WAITS:
-                return self.stream.unpack(b"")
-            data = os.read(self._fd, READ_BYTES)
+            ioctl(self._fd, termios.FIONREAD, self._waiting)
+            data = os.read(self._fd, READ_BYTES) if any(self._waiting) else b""
         except OSError as error:
             raise BackendError(f"{self._port.port}: unplugged, or not readable: {error.strerror}") from error
         return self.stream.unpack(data)

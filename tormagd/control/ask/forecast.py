@@ -187,7 +187,7 @@ def _search(history: npt.NDArray[np.float64]) -> list[float]:
     apart[0] = math.inf
     changes[TAPS] = 1.0
     sums = (changes[: TAPS + 1] / (apart * apart)) @ changes.T
-    total, variance = sums[TAPS, TAPS], np.trace(sums[:TAPS, :TAPS])
+    total, variance = sums[TAPS, TAPS], (sums[:, : TAPS + 1] * VARIANCES).sum()
     ridge = RIDGE / TAPS * variance + SAME_N**2 * total
     # the regression's constants are the last row of the inverse times the sums
     last = np.linalg.solve(sums[:, : TAPS + 1] + ridge * VARIANCES, CONSTANT)
