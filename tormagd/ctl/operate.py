@@ -129,18 +129,18 @@ def _not_done(what: str) -> CommandError:
 
 
 def home(client: Client) -> Outcome:
-    was_homed = client.status().is_homed
+    before, has_begun = client.status(), False
     result = client.request("home")
-    has_begun = False
     for elapsed_s, state in statuses(client, HOMES_S):
         require_no_fault(state, "fault while homing")
         # a homing too short to be seen has changed the device to homed
-        has_begun = has_begun or state.is_busy or (state.is_homed and not was_homed)
+        has_begun = has_begun or state.is_busy or (state.is_homed and not before.is_homed)
         if has_begun and not state.is_busy:
             if state.is_homed:
                 return Outcome({**result, "seconds": round(elapsed_s, 2)}, f"homed in {elapsed_s:.1f} s")
+            lost = f"; the link was lost: {state.link.last_loss}" * (state.link.losses > before.link.losses)
             raise CommandError(
-                Exit.REFUSED, "not_homed", "homing ended, but the device is not homed", "tormagctl status"
+                Exit.REFUSED, "not_homed", f"homing ended, but the device is not homed{lost}", "tormagctl status"
             )
         if not has_begun and elapsed_s > BEGIN_S:
             raise CommandError(
