@@ -46,6 +46,7 @@ from tormagd.record.ticks import encode_ticks
 from tormagd_client import Client, ClientError
 from tormagd_client.endpoints import ENDPOINTS, Endpoints
 from tormagd_client.messages import Request
+from tormagd_client.printable import require
 
 TOOLS = Path(__file__).parents[1]
 LOG = "tormagd.log"
@@ -116,11 +117,9 @@ def summary(pairs: list[Pair], realtime: RealTime) -> dict[str, Any]:
             "alone": "neither of the first two",
         },
     }
-    hosts = [pair.host for pair in pairs if pair.host is not None]
-    if hosts:
+    if hosts := [pair.host for pair in pairs if pair.host is not None]:
         result["reference_host"] = _middle(hosts)
-    against = [(pair.daemon, pair.against) for pair in pairs if pair.against is not None]
-    if against:
+    if against := [(pair.daemon, pair.against) for pair in pairs if pair.against is not None]:
         result["against"] = _told([theirs for _, theirs in against]) | {
             **{
                 f"{name}_ratio": round(
@@ -204,10 +203,9 @@ def reference_host(stand: Stand, seconds: float) -> dict[str, Any] | None:
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="tormag-")))
         host = built_host(folder)
         start = partial(begun, stack, folder / LOG, environment=environment(None, folder))
-        port = first_line(start(*own_machine(0, "tormagd.simulation", "--pty")))
-        words = [port, str(1_000_000 // stand.rates_hz[0]), str(seconds), str(stand.realtime.fifo_priority)]
-        ran = subprocess.run([str(host), *words], check=True, capture_output=True, text=True)
-        return dict(json.loads(ran.stdout))
+        words = [str(1_000_000 // stand.rates_hz[0]), str(seconds), str(stand.realtime.fifo_priority)]
+        command = [str(host), first_line(start(*own_machine(0, "tormagd.simulation", "--pty"))), *words]
+        return dict(json.loads(subprocess.run(command, check=True, capture_output=True, text=True).stdout))
     return None
 
 
@@ -238,6 +236,8 @@ def as_block(rows: list[list[Any]], control_hz: int) -> Block:
 def reported(address: str) -> dict[str, Any]:
     with contextlib.closing(Client(Endpoints(control=address), 5.0)) as client:
         status = client.request("status")
+    state = status.get("operating_state", "ENABLED")
+    require(state == "ENABLED", "operating_state at a block's end", state, "ENABLED: try again on a quieter machine")
     found = status.get("phases_us", {}) | {"plan_us": status.get("rates", {}).get("inference", {}).get("exec_us")}
     told = {name: {key: float(each[key]) for key in ("p50", "p99")} for name, each in found.items() if each}
     plan_us = told.pop("plan_us", None)
