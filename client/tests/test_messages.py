@@ -2,6 +2,7 @@
 
 import math
 import re
+import tracemalloc
 from pathlib import Path
 from typing import Any
 
@@ -238,6 +239,7 @@ def test_oversize_is_refused_before_it_is_read(size: int) -> None:
         b"\xdd\xff\xff\xff\xff",
         b"\xc6\xff\xff\xff\xff",
         b"\x91" * MAX_MESSAGE_BYTES,  # nested arrays
+        b"\xdc\x04\x00" * (MAX_MESSAGE_BYTES // 3),  # each claims 1,024 entries
         b"\x81\xa1a" * (MAX_MESSAGE_BYTES // 3),
         b"\x81\x01\x01",  # a key that is no text
         b"\x81\x90\x01",  # a key that cannot be hashed
@@ -248,11 +250,14 @@ def test_oversize_is_refused_before_it_is_read(size: int) -> None:
         msgpack.packb(SETPOINT) + b"\x00",
         msgpack.packb(SETPOINT)[:-1],
     ],
-    ids=range(16),
+    ids=range(17),
 )
 @pytest.mark.parametrize("kind", TYPES)
-def test_broken_msgpack_is_a_message_error(data: bytes, kind: type[Any]) -> None:
+def test_broken_msgpack_is_a_message_error_and_costs_no_memory(data: bytes, kind: type[Any]) -> None:
+    tracemalloc.start()
     refusal(data, kind)
+    assert tracemalloc.get_traced_memory()[1] < 20 * MAX_MESSAGE_BYTES
+    tracemalloc.stop()
 
 
 @pytest.mark.parametrize("depth", [100, 300, 400, 511, 600, 900, 1000, 1023, 1100])

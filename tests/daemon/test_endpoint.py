@@ -124,6 +124,22 @@ def test_a_message_that_is_too_large_is_not_read_and_its_publisher_is_heard_agai
     assert rig.endpoint.inbox.refused == 0
 
 
+@pytest.mark.parametrize(
+    ("name", "frames", "heard"),
+    [
+        ("setpoint", [b"\x00" + setpoint(1)], lambda rig: rig.endpoint.inbox.accepted),
+        ("control", [b"\x01", b"\x00" + command("stop")], lambda rig: rig.answered),
+    ],
+)
+def test_a_peer_of_which_libzmq_says_nothing_is_heard(
+    rig: Rig, name: str, frames: list[bytes], heard: Callable[[Rig], object]
+) -> None:
+    with socket.socket(socket.AF_UNIX) as old:  # ZMTP 1.0
+        old.connect(rig.addresses[name].removeprefix("ipc://"))
+        old.sendall(b"\x01\x00" + b"".join(bytes([len(frame)]) + frame for frame in frames))
+        rig.until(lambda: heard(rig))
+
+
 # -- telemetry and recording ---------------------------------------------------------------------------------------
 
 

@@ -492,6 +492,16 @@ def test_force_follows_the_setpoint_and_what_holds_it_back_is_said(armed: Runnin
     assert {"code": "F_MIN", "remedy": LIMITS[Limit.F_MIN].remedy}.items() <= status["limit_details"][0].items()
 
 
+def test_plans_go_on_whatever_is_wrong_with_what_was_sent(armed: Running) -> None:
+    armed.ask(1.0)
+    buckets, before = armed.daemon._endpoint._allowance._buckets, armed.daemon._inference.planner.planned.number
+    buckets.update(dict.fromkeys(buckets, ()))
+    for _ in range(100):
+        armed.client.publish(1.0, 30_000.0)
+        armed.tick()
+    assert armed.daemon._inference.planner.planned.number == before + 50
+
+
 def test_the_handles_motion_is_told_to_who_listens(running: Running) -> None:
     running.start(Rates(motion_hz=250))
     running.arm()

@@ -185,10 +185,14 @@ class Daemon:
 
     def _plan(self, beat: Beat) -> None:
         # before the step: a setpoint is driven in the beat that takes it
-        is_every, stepper = self._config.rates.plan_every_setpoint, self._control.stepper
-        # those that wait for a plan are cheaper together
-        has_come = (is_every or self._inference.is_due(beat)) and self._endpoint.take_setpoints()
-        self._inference.plan(beat, stepper.measured, is_asked=is_every and has_come, is_followed=stepper.is_followed)
+        is_every, stepper, has_come = self._config.rates.plan_every_setpoint, self._control.stepper, False
+        try:
+            # those that wait for a plan are cheaper together
+            has_come = (is_every or self._inference.is_due(beat)) and self._endpoint.take_setpoints()
+        finally:  # the setpoint in force ages, whatever is wrong with the next
+            self._inference.plan(
+                beat, stepper.measured, is_asked=is_every and has_come, is_followed=stepper.is_followed
+            )
 
     def _lose_link(self) -> None:
         self._causes.note_loss(self._connection.cause, self._connection.remedy)

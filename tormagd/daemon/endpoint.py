@@ -38,8 +38,8 @@ from tormagd_client.messages import (
     encode,
 )
 
-DRAIN = 32
-"Setpoints read in one beat at most; more wait for the next, so that a flood cannot stall control."
+DRAIN, DRAIN_NS = 32, 300_000
+"Setpoints read in one beat at most, and for how long; more wait for the next, so that a flood cannot stall control."
 SETPOINTS_PER_S, SETPOINT_BURST = 4_000.0, 1_000.0
 "What one publisher may send; the rest is dropped unread. The burst is what comes at once after a network's pause."
 OPTIONS: dict[int, dict[int, int]] = {
@@ -63,6 +63,7 @@ PARTS_NS, MANY_PORTIONS = 400_000, 50
 "For how long a message's further parts are read and dropped in one beat, some three hundred, and in how many beats."
 TOO_MUCH, NOT_ALLOWED, OFF_THE_LIST = "sent too much", "command not allowed", "key taken off the list"
 MANY_PARTS = "a message of thousands of parts"
+NOBODY, NO_CONNECTION = Peer(""), -1
 LEAVES_MS = 20
 OBSERVED = frozenset({"status", "describe"})
 "What an observer may ask."
@@ -116,9 +117,9 @@ class Endpoint:
     def take_setpoints(self) -> bool:
         """Read the waiting setpoints, DRAIN messages at most, into `inbox`; return True if another setpoint is in
         force."""
-        is_newer = False
+        is_newer, until_ns = False, time.monotonic_ns() + DRAIN_NS
         for _ in range(DRAIN):
-            if not self._has_message(self._setpoints, "setpoint"):
+            if time.monotonic_ns() > until_ns or not self._has_message(self._setpoints, "setpoint"):
                 break
             frame = self._unread["setpoint"] = self._setpoints.recv(zmq.NOBLOCK, copy=False)
             # both clocks at once, for each message: their difference shows which was set, and the loop may be held up
@@ -126,7 +127,7 @@ class Endpoint:
             peer, _ = self._sender(frame, "setpoint")
             if not self._allowance.grants(peer, now_s):
                 self._drops.add("setpoint", peer, TOO_MUCH)
-            elif peer.key and not self.admission.has_role(peer.key, MAY["setpoint"]):
+            elif "setpoint" in self._guarded and not self.admission.has_role(peer.key, MAY["setpoint"]):
                 self._drops.add("setpoint", peer, OFF_THE_LIST)
             else:
                 key = self.admission.allowed[peer.key].fingerprint if peer.key else ""
@@ -151,12 +152,10 @@ class Endpoint:
             with contextlib.suppress(zmq.Again):
                 while time.monotonic_ns() < until_ns:
                     frame = subscribed.recv(zmq.NOBLOCK, copy=False)
-                    peer: Peer | None = None  # where libzmq unsubscribes a peer that has gone
-                    with contextlib.suppress(zmq.ZMQError):
-                        peer, _ = self._sender(frame, name)
+                    peer, _ = self._sender(frame, name)
                     if name == "telemetry":
-                        self.listeners.hear(frame.bytes, peer)
-                    if peer is not None and not self._subscriptions[name].grants(peer, time.monotonic()):
+                        self.listeners.hear(frame.bytes, peer if peer.address else None)
+                    if peer.address and not self._subscriptions[name].grants(peer, time.monotonic()):
                         self._drops.add(name, peer, TOO_MUCH)
                         cut.add(peer.address)
             for address in cut:
@@ -282,11 +281,16 @@ class Endpoint:
             self._setpoints = self._bind(zmq.SUB, name)
 
     def _sender(self, frame: zmq.Frame, name: str) -> tuple[Peer, int]:
-        """Return the peer that sent a message, with its key where the endpoint is guarded, and its connection."""
-        connection = int(frame.get(zmq.SRCFD))
+        """Return the peer that sent a message, with its key where the endpoint is guarded, and its connection; nobody
+        where it had gone, or speaks ZMTP 1.0."""
+        try:
+            connection = int(frame.get(zmq.SRCFD))
+            key = str(frame.get("User-Id")) if name in self._guarded else ""
+            peer = Peer(str(frame.get("Peer-Address")), key)
+        except zmq.ZMQError:
+            return NOBODY, NO_CONNECTION
         self.admission.heard.add((name, connection))
-        key = str(frame.get("User-Id")) if name in self._guarded else ""
-        return Peer(str(frame.get("Peer-Address")), key), connection
+        return peer, connection
 
     def _next_request(self) -> Waiting | None:
         """Read the message that waits; None if its client was cut off."""
@@ -339,7 +343,7 @@ class Endpoint:
     def _require_permitted(self, request: Request, waiting: Waiting) -> None:
         """Raise RefusedError where the peer's key lacks the role for a request, and count it as dropped."""
         is_observed, key = request.command in OBSERVED, waiting.peer.key
-        if key and not self.admission.has_role(key, MAY["control"] if is_observed else OPERATOR):
+        if "control" in self._guarded and not self.admission.has_role(key, MAY["control"] if is_observed else OPERATOR):
             self._drops.add("control", waiting.peer, NOT_ALLOWED)
             raise RefusedError(
                 "forbidden",

@@ -36,8 +36,6 @@ class BackendError(OSError):
 
 
 Stream: TypeAlias = FrameStream | CanStream
-Received: TypeAlias = bytes | list[tuple[int, bytes]]
-"What one read returned: serial bytes, or the identifier and data of each CAN frame."
 Sent: TypeAlias = bytes | tuple[int, bytes]
 "One message on the wire, serial or CAN."
 

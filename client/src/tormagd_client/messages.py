@@ -529,6 +529,7 @@ _REMEDIES = {
     ("str", "bin"): "; pack text as str",
 }
 _KINDS = {"object": "map", "bytes": "bin"}
+_RAW = msgspec.msgpack.Decoder(msgspec.Raw)
 
 
 def decode(data: bytes, message_type: type[M]) -> M:
@@ -537,6 +538,7 @@ def decode(data: bytes, message_type: type[M]) -> M:
         raise MessageError(f"message of {len(data)} bytes: allowed is {MAX_MESSAGE_BYTES}")
     if not data:
         raise MessageError("message is empty, or has several parts: allowed is one part, the map, without a topic")
+    _require_whole(data)
     try:
         unpacked = msgpack.unpackb(
             data,
@@ -560,6 +562,15 @@ def decode(data: bytes, message_type: type[M]) -> M:
         return msgspec.convert(unpacked, message_type)
     except msgspec.ValidationError as error:
         raise MessageError(_in_words(str(error))) from error
+
+
+def _require_whole(data: bytes) -> None:
+    """Look whether all that lengths announce is there: msgpack takes memory for it before it looks."""
+    try:
+        _RAW.decode(data)
+    except (msgspec.DecodeError, RecursionError) as error:
+        if "trailing" not in str(error):
+            raise MessageError(f"not a msgpack map: {error}") from error
 
 
 def _map(pairs: list[tuple[Any, Any]]) -> dict[Any, Any]:
