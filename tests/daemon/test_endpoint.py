@@ -20,7 +20,7 @@ from sent import telemetry
 from served import MOST, NAMES, Served, command, setpoint
 
 from tormagd.control.safety.operating_state import RefusedError
-from tormagd.daemon.endpoint import DRAIN, FIRST_BURST, SETPOINT_BURST, Endpoint
+from tormagd.daemon.endpoint import DRAIN_NS, FIRST_BURST, SETPOINT_BURST, Endpoint
 from tormagd.daemon.peers import (
     LISTENERS,
     PEERS,
@@ -103,18 +103,18 @@ def test_garbage_between_setpoints_is_counted_and_does_not_hide_them(rig: Rig) -
     assert (rig.endpoint.inbox.accepted, rig.endpoint.inbox.newest.force_N) == (5, 1.4)
 
 
-def test_a_flood_is_drained_in_bounded_portions(rig: Rig) -> None:
-    publisher = rig.publisher()
-    for seq in range(3 * DRAIN):
+def test_a_flood_is_drained_in_bounded_portions(rig: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
+    publisher, accepted, clock = rig.publisher(), [0], itertools.count(0, DRAIN_NS // 4)
+    monkeypatch.setattr("time.monotonic_ns", lambda: next(clock))
+    for seq in range(100):
         publisher.send(setpoint(seq))
-    accepted = [0]
 
     def take() -> None:
         rig.endpoint.take_setpoints()
         accepted.append(rig.endpoint.inbox.accepted)
 
-    rig.until(lambda: accepted[-1] == 3 * DRAIN, take)
-    assert max(after - before for before, after in itertools.pairwise(accepted)) <= DRAIN
+    rig.until(lambda: accepted[-1] == 100, take)
+    assert max(after - before for before, after in itertools.pairwise(accepted)) == 2
 
 
 def test_a_message_that_is_too_large_is_not_read_and_its_publisher_is_heard_again(rig: Rig) -> None:

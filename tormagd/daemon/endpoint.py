@@ -38,8 +38,8 @@ from tormagd_client.messages import (
     encode,
 )
 
-DRAIN, DRAIN_NS = 32, 300_000
-"Setpoints read in one beat at most, and for how long; more wait for the next, so that a flood cannot stall control."
+DRAIN_NS = 300_000
+"For how long setpoints are read in one beat; more wait for the next, so that a flood cannot stall control."
 SETPOINTS_PER_S, SETPOINT_BURST = 4_000.0, 1_000.0
 "What one publisher may send; the rest is dropped unread. The burst is what comes at once after a network's pause."
 OPTIONS: dict[int, dict[int, int]] = {
@@ -115,12 +115,9 @@ class Endpoint:
         self.listeners = Listeners()
 
     def take_setpoints(self) -> bool:
-        """Read the waiting setpoints, DRAIN messages at most, into `inbox`; return True if another setpoint is in
-        force."""
+        """Read the waiting setpoints for DRAIN_NS into `inbox`; return True if another setpoint is in force."""
         is_newer, until_ns = False, time.monotonic_ns() + DRAIN_NS
-        for _ in range(DRAIN):
-            if time.monotonic_ns() > until_ns or not self._has_message(self._setpoints, "setpoint"):
-                break
+        while time.monotonic_ns() < until_ns and self._has_message(self._setpoints, "setpoint"):
             frame = self._unread["setpoint"] = self._setpoints.recv(zmq.NOBLOCK, copy=False)
             # both clocks at once, for each message: their difference shows which was set, and the loop may be held up
             now_s, realtime_ns = time.monotonic(), time.time_ns()
