@@ -117,8 +117,7 @@ def test_a_second_publisher_and_an_unknown_insert_are_refused_before_anything_mo
 
 def test_the_sweeps_are_a_table_for_the_laboratory(tmp_path):
     sweep = dict.fromkeys(SWEPT_COLUMNS, np.arange(9.0))
-    unknown = sweep | {"measured_cf": np.array([np.nan, *range(8)])}
-    assert write_sweeps(tmp_path / "sweeps.csv", [sweep, unknown]) == 5
+    assert write_sweeps(tmp_path / "sweeps.csv", [sweep, sweep | {"measured_cf": np.array([np.nan, *range(8)])}]) == 5
     head, *rows = csv.reader((tmp_path / "sweeps.csv").read_text().splitlines())
     assert (tuple(head), rows[1], rows[3]) == (
         SWEEP_COLUMNS,
@@ -216,8 +215,7 @@ def test_the_steps_that_are_run_are_numbered_one_by_one(monkeypatch, tmp_path, c
     run = SimpleNamespace(progress=Progress(), follow=lambda course: next(course, None))
     kept = ctl_commission.Kept(tmp_path / "7.json", begun(None, 7, 0, None, Config().motor))
     kept.follow(run, course.Known(Config(), 1e-3, 0.6, 2.0, None))
-    numbers = re.findall(r"step (\d) of (\d)", capsys.readouterr().err)
-    assert numbers == [(str(number), "8") for number in range(1, 9)]
+    assert re.findall(r"step (\d) of (\d)", capsys.readouterr().err) == [(str(number), "8") for number in range(1, 9)]
 
 
 def test_who_ends_the_input_has_not_agreed_that_anything_moves(monkeypatch, terminal) -> None:

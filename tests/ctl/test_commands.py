@@ -131,8 +131,11 @@ def test_what_a_daemon_answers_decides_the_exit_code_and_is_told(
 @pytest.mark.parametrize(("code", "expected"), [("not_homed", 1), ("fault", 4), ("device_latched", 4)])
 def test_a_refusal_tells_code_message_and_hint(fake_daemon, ctl, code, expected):
     fake_daemon.refuse("enable", code)
-    refused = ctl(*fake_daemon.at, "--json", "enable").ended(expected)
-    assert refused.error == {"code": code, "message": "cannot enable", "hint": "do this first"}
+    assert ctl(*fake_daemon.at, "--json", "enable").ended(expected).error == {
+        "code": code,
+        "message": "cannot enable",
+        "hint": "do this first",
+    }
     captured = ctl(*fake_daemon.at, "enable").ended(expected)
     assert (captured.out, captured.err) == ("", "tormagctl enable: cannot enable\n  next: do this first\n")
 

@@ -22,8 +22,7 @@ def keys(tmp_path: Path, ctl) -> Path:
 
 
 def test_one_command_makes_the_server_its_clients_and_the_lists(keys: Path) -> None:
-    made = {str(path.relative_to(keys)) for path in keys.rglob("*")}
-    assert made == {
+    assert {str(path.relative_to(keys)) for path in keys.rglob("*")} == {
         *("server.key", "server.key_secret", "console.key_secret", "robot.key_secret"),
         *("publish", "operate", "observe", "publish/robot.key", "operate/console.key"),
     }

@@ -41,8 +41,13 @@ def test_record_then_plot(fake_daemon, tmp_path, ctl, file):
         subprocess.run([*told, "plot", str(file), "-o", "b.png"], cwd=tmp_path, check=True, timeout=60)
         assert (tmp_path / "b.png").read_bytes().startswith(b"\x89PNG")
     file.write_bytes(file.read_bytes()[:-40])
-    assert "cut short: its recorder did not end it" in ctl("plot", str(file), "-o", str(picture)).ended(0).out
-    assert "no overview: still written, not ended by" in ctl("recordings", "list", str(file.parent)).ended(0).out
+    export = "recordings", "export", str(file), "--to", str(tmp_path / "copy.mcap")
+    for arguments, code in (
+        (("plot", str(file), "-o", str(picture)), 0),
+        (export, 1),
+        ((*export[:1], "list", str(tmp_path)), 0),
+    ):
+        assert "cut short: its recorder did not end it" in ctl(*arguments).ended(code).out
 
 
 def test_a_daemon_that_does_not_say_what_it_runs_is_not_recorded(fake_daemon, tmp_path, ctl):
@@ -101,8 +106,10 @@ def test_a_folder_of_recordings_is_listed_pruned_marked_and_exported(fake_daemon
     data = bytearray(Path(kept).read_bytes())
     data[3_000] ^= 1  # in a chunk
     (tmp_path / "odd.mcap").write_bytes(data)
-    odd = ctl(*command, "recordings", "export", str(tmp_path / "odd.mcap"), "--to", str(tmp_path / "b.mcap")).ended(1)
-    assert odd.result["damage"] == "the CRC of its data is wrong"
+    for odd, said in (("odd.mcap", "the CRC of its data is wrong"), ("t.toml", "it does not begin as an MCAP file")):
+        export = "recordings", "export", str(tmp_path / odd), "--to", str(tmp_path / f"copy of {odd}.mcap")
+        assert ctl(*command, *export).ended(1).result["damage"] == said
+        assert said in ctl("recordings", "list", str(tmp_path)).ended(0).out
     config.write_text(config.read_text() + "most_days = 1e-9\n")
     assert ctl(*command, "recordings", "prune").ended(0).result["removed"] == names[:-1]
     assert [path.name for path in folder.iterdir()] == [Path(kept).name]

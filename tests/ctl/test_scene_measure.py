@@ -52,8 +52,9 @@ def truth_of(off_N: float, gap_mm: float) -> tuple[Course, Heard]:
 
 @pytest.mark.parametrize(("off_N", "gap_mm", "seen_N"), [(0.02, 60.0, 0.02), (-0.02, 95.0, 0.02), (0.02, 95.0, 0.0)])
 def test_an_error_is_the_plants_and_an_open_gaps_excess_is_none(off_N: float, gap_mm: float, seen_N: float) -> None:
-    found = errors_N(*truth_of(off_N, gap_mm), OPEN_MM, 0.0)
-    assert found == pytest.approx(dict.fromkeys(("signal", "seldom", "steps", "contact"), seen_N), abs=1e-5)
+    assert errors_N(*truth_of(off_N, gap_mm), OPEN_MM, 0.0) == pytest.approx(
+        dict.fromkeys(("signal", "seldom", "steps", "contact"), seen_N), abs=1e-5
+    )
 
 
 def test_a_step_that_still_comes_does_not_count() -> None:

@@ -54,8 +54,7 @@ class Rig(Served):
 
     def dial(self, name: str = "setpoint") -> socket.socket:
         """A stranger at a TCP port, who has said nothing yet."""
-        port = int(self.addresses[name].rsplit(":", 1)[1])
-        return socket.create_connection(("127.0.0.1", port), timeout=PATIENCE_S)
+        return socket.create_connection(("127.0.0.1", int(self.addresses[name].rsplit(":", 1)[1])), timeout=PATIENCE_S)
 
     def newest(self) -> tuple[str, str, str]:
         """Where, why and with which key a peer was refused last."""

@@ -282,8 +282,7 @@ def test_however_seldom_telemetry_is_told_every_tick_is_recorded(running: Runnin
 def test_a_daemon_describes_what_it_runs(alone: Running) -> None:
     described = msgspec.convert(alone.command("describe"), Description)
     names = ("model", "build", "firmware", "serial_number", "configuration_file")
-    known = [alone.core.model, str(settle()), None, None, CONFIG_FILE]
-    assert [getattr(described, name) for name in names] == known
+    assert [getattr(described, name) for name in names] == [alone.core.model, str(settle()), None, None, CONFIG_FILE]
     of_parts = described.scene["name"], described.configuration["realtime"]["watchdog_ms"]
     assert of_parts == (alone.core.scene.name, WATCHDOG_MS)
     assert alone.command("status")["not_granted"] == [*NOT_GRANTED]

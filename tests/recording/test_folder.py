@@ -147,8 +147,7 @@ def test_a_segment_that_somebody_renamed_is_recorded_on(tmp_path: Path, capsys: 
 
 
 def test_a_recorder_whose_budget_is_full_ends_its_segment_in_order(tmp_path: Path) -> None:
-    clock = Clock()
-    recorder = RecordingWriter(RecordingFolder(tmp_path, SETTINGS, clock))
+    recorder = RecordingWriter(RecordingFolder(tmp_path, SETTINGS, Clock()))
     mark(recorder.path)  # by somebody else: the recorder goes on
     (tmp_path / "another.mcap").write_bytes(b"x" * 1_900_000)
     newest = Mark(t_ns=START_NS + 10, text="here")
@@ -200,8 +199,7 @@ def test_a_year_of_recording_never_outgrows_its_budget_and_keeps_its_marks(tmp_p
         written_bytes += sum(each.bytes for each in segments if each.path not in before)
     assert written_bytes > 3_000_000
     assert marks_in(tmp_path) == set(marks) != set()
-    known = [RecordingFile(each) for each in tmp_path.iterdir()]
-    assert {(each.is_complete, each.damage) for each in known} == {(True, "")}
+    assert {(each.is_complete, each.damage) for each in map(RecordingFile, tmp_path.iterdir())} == {(True, "")}
 
 
 KILLED = """

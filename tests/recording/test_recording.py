@@ -21,7 +21,7 @@ from mcap.records import ChunkIndex
 from sent import COLUMNS, START_NS, back, batch, telemetry, tell
 
 from tormagd.record.overview import MAX_STRETCHES, Codes, Glance, OverviewBuilder, unpacked
-from tormagd.record.reader import RecordingError, RecordingFile, damage_in, overview_of
+from tormagd.record.reader import RecordingError, RecordingFile, overview_of
 from tormagd.record.stream import TOLD
 from tormagd.record.ticks import decode_ticks
 from tormagd.record.writer import THINNED, RecordingWriter
@@ -363,8 +363,7 @@ def test_no_byte_is_changed_unnoticed_and_the_rest_is_a_recording_or_a_recording
     data, changed = bytearray(written.read_bytes()), written.with_name("changed.mcap")
     data[int(place * (len(data) - 1))] ^= value
     changed.write_bytes(data[: int(keep * len(data))])
-    with changed.open("rb") as file:
-        assert damage_in(file) or overview_of(changed) is None
+    assert overview_of(changed)[0] is None
     try:
         back(changed)
     except RecordingError as error:

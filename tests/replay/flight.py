@@ -48,11 +48,10 @@ class Flight:
         self._box.begin(self.loop.stepper, self.planner, self.loop.connection)
         self.loop.connection.traffic = self._heard
         self._inbox = SetpointInbox()
-        period_ns = NS // config.rates.inference_hz
         self.inference = InferenceLoop(
             self.planner,
             self._inbox,
-            period_ns,
+            NS // config.rates.inference_hz,
             clock_ns=lambda: self._now_ns,
             journal=self._journal,
             on_failure=self._fail,

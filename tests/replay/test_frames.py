@@ -121,8 +121,10 @@ def test_a_memory_that_differs_is_found_where_no_tick_shows_it(
     place, (*outer, name) = place_of(box.entries, "state", DAMAGED_TICK), way.split(".")
     memory = msgspec.msgpack.decode(msgspec.msgpack.encode(box.entries[place][part]))
     reduce(getitem, outer, memory)[name] += 1e-9
-    entries = altered(box.entries, place, part, memory)
-    assert rerun(core, entries, SNAPSHOT_S - 0.5).difference.field == f"state.{field}.{name}"
+    assert (
+        rerun(core, altered(box.entries, place, part, memory), SNAPSHOT_S - 0.5).difference.field
+        == f"state.{field}.{name}"
+    )
 
 
 def test_a_link_that_was_lost_and_came_back_is_run_again(fly: Any, core: Core, tmp_path: Path) -> None:

@@ -117,8 +117,9 @@ def test_the_other_build_replays_them_to_the_bit(fly: Any, path: Path, tmp_path:
     stalled = fly(until_s=2.8, silent_s=0.083).write(tmp_path / "stalled.mcap")
     for box, from_s, ticks in ((path, 3.0, TICKS - 3_000), (stalled, 0.0, 3_000)):
         command = [sys.executable, "-P", "-m", "tormagd.ctl.main", "--json", "replay", str(box), "--from", str(from_s)]
-        environment = os.environ | {SWITCH: switch, "PYTHONPATH": str(ROOT)}
-        result = json.loads(subprocess.check_output(command, env=environment, text=True))["result"]
+        result = json.loads(
+            subprocess.check_output(command, env=os.environ | {SWITCH: switch, "PYTHONPATH": str(ROOT)}, text=True)
+        )["result"]
         assert (result["rerun"]["difference"], result["rerun"]["ticks"]) == (None, ticks)
         assert switch == "1" or result["build"].startswith("interpreted")
 
@@ -145,8 +146,7 @@ def test_a_plan_that_failed_fails_again_and_what_followed_is_the_same(fly: Any, 
     done = rerun(core, box.entries)
     assert (done.difference, done.ticks, done.snapshots) == (None, 3_600, 7)
     # a plan that fails only here is no such plan
-    entries = [*box.entries[: place - 1], *box.entries[place + 1 :]]
-    found = rerun(core, entries, 3.0).difference
+    found = rerun(core, [*box.entries[: place - 1], *box.entries[place + 1 :]], 3.0).difference
     assert (found.tick, found.field, found.recorded, found.replayed) == (
         3_101,
         "plan",
@@ -259,8 +259,7 @@ def test_what_is_not_as_it_was_is_told(box: BlackBoxFile) -> None:
 
 def run(path: Path) -> None:
     found = BlackBoxFile(path)
-    known = recorded(found)
-    rerun(rebuilt(known), found.entries)
+    rerun(rebuilt(recorded(found)), found.entries)
 
 
 def refusal(path: Path) -> str:
@@ -299,8 +298,12 @@ def test_random_bytes_are_refused_and_of_damaged_ones_the_rest_is_replayed(
 
 
 def test_another_recording_or_version_is_refused(box: BlackBoxFile, tmp_path: Path) -> None:
-    (tmp_path / "other.mcap").write_bytes(messages(b"{}", topic="/core", about={}))
-    assert "no black box" in refusal(tmp_path / "other.mcap")
+    for data, said in (
+        (other := messages(b"{}", topic="/core", about={}), "no black box"),
+        (b"x" + other[1:], "damaged"),
+    ):
+        (tmp_path / "other.mcap").write_bytes(data)
+        assert said in refusal(tmp_path / "other.mcap")
     for number, (header, said) in enumerate(
         (
             (box.metadata | {"format": "4"}, FORMER),

@@ -71,8 +71,7 @@ def measured(path: Path | None, machine: Machine) -> Headroom:
         raise CommandError(
             Exit.REFUSED, "not_measured", f"this machine could not be measured: {error}", "try it again"
         ) from error
-    found = msgspec.json.decode(printed, type=Headroom)
-    return msgspec.structs.replace(found, steal=share(before, machine.stolen()))
+    return msgspec.structs.replace(msgspec.json.decode(printed, type=Headroom), steal=share(before, machine.stolen()))
 
 
 def share(before: tuple[int, int], after: tuple[int, int]) -> float:

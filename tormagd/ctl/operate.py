@@ -45,8 +45,7 @@ LONGEST_WRITE_S = 30.0
 def arm(client: Client) -> Outcome:
     """Have the daemon clear faults, home and enable as needed, and report each step on stderr."""
     begun_s = time.monotonic()
-    given = client.arm(ARMS_S, report_step)
-    return armed(given, client.status(), time.monotonic() - begun_s)
+    return armed(client.arm(ARMS_S, report_step), client.status(), time.monotonic() - begun_s)
 
 
 def report_step(step: str) -> None:

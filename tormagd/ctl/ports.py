@@ -28,8 +28,7 @@ def ports(config: Config, root: Path = Path("/")) -> Outcome:
     import can
     from serial.tools.list_ports import comports
 
-    asked = sorted(set(can.VALID_INTERFACES) - set(NOT_ASKED))
-    channels = can.detect_available_configs(asked, timeout=DETECTION_S)
+    channels = can.detect_available_configs(sorted(set(can.VALID_INTERFACES) - set(NOT_ASKED)), timeout=DETECTION_S)
     found = survey(config, Machine(root), comports(), channels)
     return Outcome(found, folded(_text(found, config, Colour(sys.stdout))))
 
@@ -83,8 +82,9 @@ def _serial_port(machine: Machine, path: str, info: Any, opened: Sequence[tuple[
 
 
 def _is_line(config: Config) -> bool:
-    is_adapter = config.device.options.get("interface") == "slcan"
-    return config.device.port.startswith("/") and (config.device.backend != "can" or is_adapter)
+    return config.device.port.startswith("/") and (
+        config.device.backend != "can" or config.device.options.get("interface") == "slcan"
+    )
 
 
 def _is_up(machine: Machine, channel: str) -> bool | None:

@@ -34,7 +34,7 @@ from tormagd.ctl.outcome import (
 from tormagd.ground.files import new_file
 from tormagd.ground.terminal import interrupted_by, write_line
 from tormagd.record.folder import RecordingFolder, Segment, mark as mark_segment
-from tormagd.record.reader import RecordingError, damage_in, overview_of
+from tormagd.record.reader import Contents, RecordingError, damage_in, overview_of
 from tormagd.record.rerun import ReplayError, rebuilt, reopened, rerun
 from tormagd.record.ticks import MAX_BATCH_BYTES, decode_ticks
 from tormagd.record.writer import RecordingWriter
@@ -195,17 +195,17 @@ def _list(folder: RecordingFolder) -> Outcome:
         f"{'marked' if row['is_marked'] else '':<7}{row['said']}"
         for row in rows
     ]
-    count = f"{len(rows)} recording{'s' * (len(rows) != 1)}"
-    total = f"{count}, {size_MB:.1f} of {folder.budget.most_MB:.1f} MB in {folder.path}"
+    total = f"{_count(rows)}, {size_MB:.1f} of {folder.budget.most_MB:.1f} MB in {folder.path}"
     return Outcome({"folder": str(folder.path), "recordings": rows, "MB": size_MB}, "\n".join([*lines, total]))
 
 
 def _row(segment: Segment) -> dict[str, Any]:
-    """Describe one segment by its overview; without one, `said` tells why."""
+    """Describe one segment by its overview, and what is wrong."""
     try:
-        overview, said = overview_of(segment.path), "no overview: still written, not ended by its recorder, or older"
+        overview, known = overview_of(segment.path)
+        said = known.notes or ([] if overview else ["no overview: another tormagd wrote it"])
     except RecordingError as error:
-        overview, said = None, str(error).removeprefix(f"{segment.path}: ")
+        overview, said = None, [str(error).removeprefix(f"{segment.path}: ")]
     faults = [] if overview is None else list(overview.spans_s("faults"))
     marks = [] if overview is None else [each.text for each in overview.marks]
     return {
@@ -216,7 +216,7 @@ def _row(segment: Segment) -> dict[str, Any]:
         "seconds": None if overview is None else round(overview.duration_s, 3),
         "faults": faults,
         "marks": marks,
-        "said": said if overview is None else ", ".join([*faults, *(f"“{text}”" for text in marks)]),
+        "said": ", ".join([*said, *faults, *(f"“{text}”" for text in marks)]),
     }
 
 
@@ -224,13 +224,17 @@ def _prune(folder: RecordingFolder) -> Outcome:
     """Delete what is over the budget, and say what was deleted and whether that is enough."""
     gone = folder.prune()
     over = folder.over(folder.segments())
-    names = [each.path.name for each in gone]
-    text = f"{len(gone)} recording{'s' * (len(gone) != 1)} taken away, {sum(each.bytes for each in gone) / 1e6:.1f} MB"
-    return Outcome({"removed": names, "over": over}, f"{text}\n{over}".strip(), Exit.REFUSED if over else Exit.DONE)
+    result = {"removed": [each.path.name for each in gone], "over": over}
+    text = f"{_count(gone)} taken away, {sum(each.bytes for each in gone) / 1e6:.1f} MB\n{over}"
+    return Outcome(result, text.strip(), Exit.REFUSED if over else Exit.DONE)
+
+
+def _count(of: Sequence[object]) -> str:
+    return f"{len(of)} recording{'s' * (len(of) != 1)}"
 
 
 def _export(path: Path, target: Path | None) -> Outcome:
-    """Copy a recording to a new file, check the copy's CRCs, and tell its SHA-256; REFUSED where it is damaged."""
+    """Copy a recording to a new file, check the copy's CRCs, and tell its SHA-256; REFUSED where it is not whole."""
     if target is None:
         raise usage_error("export: no place is named", f"tormagctl recordings export {path} --to FOLDER")
     copy = target / path.name if target.is_dir() else target
@@ -239,9 +243,11 @@ def _export(path: Path, target: Path | None) -> Outcome:
         shutil.copyfile(path, copy)
     with copy.open("rb") as made:
         digest = hashlib.file_digest(made, "sha256").hexdigest()
-        damage = damage_in(made)
-    text = "\n".join([f"{copy}: SHA-256 {digest}", *([f"damaged: {damage}"] if damage else [])])
-    return Outcome({"file": str(copy), "sha256": digest, "damage": damage}, text, Exit.REFUSED if damage else Exit.DONE)
+        known = Contents(made)
+        known.damage = damage_in(made)
+    exit_code = Exit.DONE if known.is_complete and not known.damage else Exit.REFUSED
+    result = {"file": str(copy), "sha256": digest, "damage": known.damage, "notes": known.notes}
+    return Outcome(result, "\n".join([f"{copy}: SHA-256 {digest}", *known.notes]), exit_code)
 
 
 def replay(
@@ -256,8 +262,7 @@ def replay(
     if from_s if changes else plant:
         said = "--from: allowed only without" if changes else "--plant: allowed only with"
         raise usage_error(f"{said} --set or --fault", "tormagctl replay --help")
-    rehearsed = [f"--plant={plant or 'sample_1'}", *changes]
-    result = _rehearsed(path, rehearsed) if changes else _again(path, from_s)
+    result = _rehearsed(path, [f"--plant={plant or 'sample_1'}", *changes]) if changes else _again(path, from_s)
     head = f"altered: {result['odd']}\n" if result["odd"] else ""
     notes = "".join(f"\nnot as it was: {each}" for each in result["differences"])
     notes += "" if result["is_complete"] else "\nthe file is cut short"

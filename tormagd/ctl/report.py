@@ -19,7 +19,7 @@ def _outcome(of: list[RecordingFile], target: Path, result: dict[str, Any]) -> O
     """Say what was written, and what to note of each recording; REFUSED if one is damaged."""
     said = (f"{each.path}: {'. '.join(each.notes)}" for each in of if each.notes)
     notes = {str(each.path): each.notes for each in of}
-    exit_code = Exit.REFUSED if any(each.damage for each in of) else Exit.DONE
+    exit_code = Exit.REFUSED if any(each.damage or each.lost for each in of) else Exit.DONE
     return Outcome({"file": str(target), "notes": notes, **result}, "\n".join([*said, str(target)]), exit_code)
 
 

@@ -158,8 +158,11 @@ def _end(file: BinaryIO) -> tuple[int, int]:
 
 
 def damage_in(file: BinaryIO) -> str:
-    """Say which CRC of a closed MCAP file is wrong; empty for none, and for a file cut short."""
+    """Say which CRC of a closed MCAP file is wrong, or that it is none; empty otherwise."""
     try:
+        file.seek(0)
+        if file.read(MAGIC_SIZE) != MCAP0_MAGIC:
+            return "it does not begin as an MCAP file"
         summary_at, at = _end(file)
         if not summary_at:
             return ""
@@ -198,6 +201,7 @@ class Contents:
         self.places: list[Place] = []
         self.lost: dict[int, str] = {}
         "What is wrong, by where the chunk begins."
+        self.damage = ""
         self._overview_at = 0
         self._is_closed = self._read_summary(file)
 
@@ -205,6 +209,17 @@ class Contents:
     def is_complete(self) -> bool:
         """False if the recorder was killed or the disk was full: earlier messages are there."""
         return self._is_closed and CUT not in self.metadata
+
+    @property
+    def notes(self) -> list[str]:
+        """What its reader has to know."""
+        lost, known = list(self.lost.values()), self.metadata
+        return [
+            *([f"damaged: {self.damage}"] if self.damage else []),
+            *([f"left out: {len(lost)} damaged, {lost[0]}"] if lost else []),
+            *([] if self.is_complete else [f"cut short: {known.get(CUT, 'its recorder did not end it, or goes on')}"]),
+            *([f"thinned: {known[THINNED]}"] if THINNED in known else []),
+        ]
 
     def _read_summary(self, file: BinaryIO) -> bool:
         """Read what stands at the end, and return whether all of that is there."""
@@ -266,8 +281,7 @@ class Contents:
             for record in records:
                 self._take(record, place.at)
                 if isinstance(record, Message):
-                    topic = self.topics.get(record.channel_id, "")
-                    yield Shown(topic, record.log_time, record.sequence, record.data)
+                    yield Shown(self.topics.get(record.channel_id, ""), record.log_time, record.sequence, record.data)
 
     def read(self, file: BinaryIO, wanted: Any, from_ns: int = 0, to_ns: int = END_NS) -> Iterator[Shown]:
         """Yield the ticks and snapshots from `from_ns` to `to_ns`, inclusive, decoded as `wanted`."""
@@ -284,8 +298,9 @@ class Contents:
             raise ValueError(f"no channel {TELEMETRY_TOPIC} or {TICKS_TOPIC} in it; `tormagctl record` makes one")
 
     def read_overview(self, file: BinaryIO) -> Overview | None:
-        """Read the overview of a closed file, if there is one."""
-        if not self._is_closed or not self._overview_at:
+        """Read the overview of a closed file without damage, if there is one."""
+        self.damage = damage_in(file)
+        if self.damage or not self._is_closed or not self._overview_at:
             return None
         self._require_topics()
         return unpacked(_at(file, self._overview_at, Attachment).data)
@@ -319,21 +334,13 @@ class RecordingFile(Contents):
         self.path, self.name = path, printable(path.name)
         with opened(path) as file:
             super().__init__(file)
-            self.damage = damage_in(file)
-            overview = None if self.damage else self.read_overview(file)
+            overview = self.read_overview(file)
             if overview is None:
                 builder = OverviewBuilder()
                 for seen in self.read(file, Glance):
                     builder.add(seen.t_ns, seen.is_tick, seen.message)
                 overview = builder.made()
-        self.overview, lost, known = overview, list(self.lost.values()), self.metadata
-        self.notes = [
-            *([f"damaged: {self.damage}"] if self.damage else []),
-            *([f"left out: {len(lost)} damaged, {lost[0]}"] if lost else []),
-            *([] if self.is_complete else [f"cut short: {known.get(CUT, 'its recorder did not end it')}"]),
-            *([f"thinned: {known[THINNED]}"] if THINNED in known else []),
-        ]
-        "What its reader has to know, in words."
+        self.overview = overview
 
     def between(self, from_ns: int, to_ns: int, wanted: Any) -> list[Shown]:
         """Return the ticks and snapshots from `from_ns` to `to_ns`, inclusive, in the file's order."""
@@ -345,7 +352,7 @@ class RecordingFile(Contents):
 
 
 class BlackBoxFile(Contents):
-    """The entries of all parts of `/core` in their order, as plain data, for a replay.
+    """The entries of all parts of `/core` in order, as plain data, for a replay.
 
     A file that was cut short, or is longer than what is read, has those up to there, and is not complete. A message of
     another topic is compared with what `/core` gives.
@@ -361,20 +368,18 @@ class BlackBoxFile(Contents):
         with opened(path) as file:
             super().__init__(file)
             self._read_core(file)
-            damage = damage_in(file)
+            self.damage = damage_in(file)
+        damage = next(iter(self.lost.values()), self.damage)
         if not self.entries:
-            said = f"no black box of tormagd: it has nothing in {CORE_TOPIC}, or not what a replay needs"
-            raise RecordingError(f"{path}: {said}")
+            none = f"no black box of tormagd: it has nothing in {CORE_TOPIC}, or not what a replay needs"
+            raise RecordingError(f"{path}: {f'damaged: {damage}' if damage else none}")
         if self._expected and self.is_complete and not self.lost:
             self._compare(self._expected[0], None)
-        self._note(damage)
+        self.odd = self.odd or damage
 
     @property
     def is_complete(self) -> bool:
         return super().is_complete and not self._is_over
-
-    def _note(self, odd: str) -> None:
-        self.odd = self.odd or odd
 
     def _read_core(self, file: BinaryIO) -> None:
         """Keep the entries of `/core`, and compare what is derived of them, as far as no chunk is lost."""
@@ -389,7 +394,7 @@ class BlackBoxFile(Contents):
     def _compare(self, sent: Shown, expected: Shown | None) -> None:
         if sent != expected:
             other = expected or sent
-            self._note(f"message {other.sequence} in {other.topic} is not what {CORE_TOPIC} has")
+            self.odd = self.odd or f"message {other.sequence} in {other.topic} is not what {CORE_TOPIC} has"
 
     def _part(self, columns: tuple[str, ...], data: bytes) -> None:
         entries, self._size = msgspec.msgpack.decode(data, type=list[Any]), self._size + len(data)
@@ -401,7 +406,7 @@ class BlackBoxFile(Contents):
             for shown in () if self.lost else self._derived.of(columns, entries):
                 self._expected.append(shown._replace(message=msgspec.json.encode(shown.message)))
         except (ValueError, TypeError, AttributeError, OverflowError, LookupError) as error:
-            self._note(f"{CORE_TOPIC}: {str(error)[:100]}")
+            self.odd = self.odd or f"{CORE_TOPIC}: {str(error)[:100]}"
         self.entries.extend(entries)
 
     def _join(self, numbers: list[int]) -> None:
@@ -411,7 +416,8 @@ class BlackBoxFile(Contents):
         self._tick = numbers[-1] if numbers else self._tick
 
 
-def overview_of(path: Path) -> Overview | None:
+def overview_of(path: Path) -> tuple[Overview | None, Contents]:
     """Read the overview at the end of the file, if there is one."""
     with opened(path) as file:
-        return Contents(file).read_overview(file)
+        known = Contents(file)
+        return known.read_overview(file), known

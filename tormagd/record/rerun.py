@@ -71,8 +71,8 @@ def reopened(path: Path) -> Iterator[tuple[Recorded, dict[str, Any]]]:
         yield known, told
     except ReplayError as error:
         other = box.metadata.get("sources_sha256", "") not in ("", sources_hash())
-        hint = "; another tormagd wrote it: replay it with that one" if other else ""
-        raise ReplayError(f"{path}: {error}{hint}") from error
+        hint = "; another tormagd wrote it: replay it with that one" * other
+        raise ReplayError(f"{path}: {error}{f'; damaged: {box.damage}' if box.damage else hint}") from error
 
 
 def recorded(box: BlackBoxFile) -> Recorded:
