@@ -256,6 +256,7 @@ def test_check_prints_the_resolved_configuration_and_names_a_broken_plugin(write
     known = ("serial", "tormagd.hardware.serial_backend:DRIVER"), ("broken", "no_such_module_anywhere:open")
     points = [metadata.EntryPoint(*each, ENTRY_POINTS) for each in known]
     monkeypatch.setattr(metadata, "entry_points", lambda group: points if group == ENTRY_POINTS else [])
+    monkeypatch.setattr("os.access", lambda *_: False)
     assert main(["--config", str(write('scene = "pulse"\n')), "--check"]) == 0
     resolved = json.loads(capsys.readouterr().out)
     assert (resolved["backends"]["serial"], "no_such_module_anywhere" in resolved["backends"]["broken"]) == (
@@ -281,6 +282,13 @@ def test_check_prints_the_resolved_configuration_and_names_a_broken_plugin(write
         ),
         ("[device.options]\ninterface = 'slcan'", "unknown field `interface` - at `$.device.options`"),
         ("[device]\nbackend = 'can'", "missing required field `interface` - at `$.device.options`"),
+        (
+            f"[black_box]\nfolder = '{__file__}'",
+            f"allowed is a folder that this process may write to, or make; {__file__}",
+        ),
+        (f"[device]\nprofiles = '{__file__}/new'", "allowed is a folder that this process may write to, or make"),
+        (f"[device]\ncalibrations = '{__file__}'", "allowed is a folder that this process may read"),
+        ('[black_box]\nfolder = "a\\u0000b"', "allowed is a folder"),
         ("[position]\nproportional_per_mm = 500.0", "margin"),
         ("[position]\ngap_acceleration_mm_s2 = 379.0", "gap_acceleration_mm_s2 = 379: allowed is at least 382"),
         ("[position]\nclosing_mm_s = 60.0", "closing_mm_s = 60: allowed is at most 43.7, what the motors can"),
@@ -367,9 +375,10 @@ def test_a_calibration_goes_before_the_configurations_own_keys(write) -> None:
     calibrated = load_calibration(
         write("serial_number = 7\n[motor]\nresistance_ohm = 2.5\n[trim]\nleast = 0.8"), config, 7
     )
-    motor = msgspec.structs.replace(config.motor, resistance_ohm=2.5)
     assert calibrated == msgspec.structs.replace(
-        config, motor=motor, trim=msgspec.structs.replace(config.trim, least=0.8)
+        config,
+        motor=msgspec.structs.replace(config.motor, resistance_ohm=2.5),
+        trim=msgspec.structs.replace(config.trim, least=0.8),
     )
 
 

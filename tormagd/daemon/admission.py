@@ -30,8 +30,8 @@ import zmq.utils.monitor
 from zmq.utils import z85
 
 from tormagd.daemon.peers import Allowance, Arrivals, Peer, Tally, shown
-from tormagd.daemon.socket_file import CREDENTIALS
 from tormagd.ground.access_keys import Allowed, KeyRing
+from tormagd.ground.files import CREDENTIALS
 from tormagd_client.endpoints import ROLES
 from tormagd_client.keys import fingerprint
 

@@ -5,15 +5,11 @@ import fcntl
 import os
 import socket
 import stat
-import struct
 from collections.abc import Iterator
 from pathlib import Path
 
 from tormagd.ground.access_keys import require_own
-from tormagd.ground.files import is_left_socket
-
-CREDENTIALS = struct.Struct("3i")
-"Process, user and group of a connection's other end: `struct ucred` of unix(7)."
+from tormagd.ground.files import listener_of
 
 
 class SocketFile:
@@ -94,16 +90,8 @@ def _require_left(path: Path) -> None:
     """Raise OSError for what is no socket, and for one that somebody has open."""
     if not stat.S_ISSOCK(path.lstat().st_mode):
         raise OSError(f"{path} is there and not a socket; it is left alone: name another path")
-    if not is_left_socket(path):
-        process = _listener(path) or "not known"
-        raise OSError(f"already running, pid {process}; end it, or name other addresses in [endpoints]")
-
-
-def _listener(path: Path) -> int:
-    """Return the process that listens at a socket, 0 if the kernel does not say."""
-    with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM | socket.SOCK_NONBLOCK) as probe:
-        probe.connect_ex(str(path))
-        return int(CREDENTIALS.unpack(probe.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, CREDENTIALS.size))[0])
+    if (process := listener_of(path)) is not None:
+        raise OSError(f"already running, pid {process or 'not known'}; end it, or name other addresses in [endpoints]")
 
 
 def _identity(path: Path) -> tuple[int, int] | None:

@@ -2,9 +2,11 @@
 
 import argparse
 import asyncio
+import os
 import sys
 from collections.abc import Callable
 from functools import partial
+from pathlib import Path
 
 import msgspec
 import uvloop
@@ -23,13 +25,14 @@ from tormagd.hardware.backend import Backend, choose, installed
 from tormagd.scenes.measured import at_rates_of
 from tormagd.scenes.scene import load_scene
 from tormagd_client.endpoints import ENDPOINTS, ConfigError
-from tormagd_client.printable import printable
+from tormagd_client.printable import in_short, printable
 
 
 def start(options: argparse.Namespace) -> int:
     try:
         config = _configured(options)
         keys = KeyRing(config.endpoints) if any(map(config.endpoints.is_guarded, ENDPOINTS)) else None
+        _require_folders(config)
         core = build_core(config)
         backend = choose(config.device, config.rates)
     except ConfigError as error:
@@ -50,6 +53,19 @@ def _configured(options: argparse.Namespace) -> Config:
     if options.scene is not None:
         config = msgspec.structs.replace(config, scene=options.scene)
     return at_rates_of(load_scene(config.scene), config)
+
+
+def _require_folders(config: Config) -> None:
+    for key, given, mode, allowed in (
+        ("black_box.folder", config.black_box.folder, os.W_OK, "write to, or make"),
+        ("device.profiles", config.device.profiles, os.W_OK, "write to, or make"),
+        ("device.calibrations", config.device.calibrations, os.R_OK, "read"),
+    ):
+        folder = Path(given or "/").absolute()
+        there = next(each for each in (folder, *folder.parents) if os.path.lexists(each))
+        if given and not (given.isprintable() and there.is_dir() and os.access(there, mode | os.X_OK)):
+            said = f"allowed is a folder that this process may {allowed}; {there} is none"
+            raise ConfigError(f"{key} = {in_short(given)}: {said}")
 
 
 async def _run(

@@ -7,6 +7,7 @@ import contextlib
 import errno
 import os
 import socket
+import struct
 from collections.abc import Iterable, Iterator
 from importlib.resources.abc import Traversable
 from pathlib import Path
@@ -14,6 +15,9 @@ from pathlib import Path
 from tormagd_client.endpoints import ConfigError
 from tormagd_client.printable import in_short
 from tormagd_client.regular_file import require_regular
+
+CREDENTIALS = struct.Struct("3i")
+"Process, user and group of a connection's other end: `struct ucred` of unix(7)."
 
 
 def read_bounded(path: Path, most_bytes: int) -> bytes:
@@ -51,10 +55,13 @@ def new_file(path: Path) -> Iterator[Path]:
         yield path
 
 
-def is_left_socket(path: Path) -> bool:
-    """Tell whether nobody has the socket open: the kernel then refuses a connection, of whatever type it was."""
+def listener_of(path: Path) -> int | None:
+    """Return the process that listens at a socket, 0 if the kernel does not say; None where it refuses a connection of
+    whatever type."""
     with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM | socket.SOCK_NONBLOCK) as probe:
-        return probe.connect_ex(str(path)) in (errno.ECONNREFUSED, errno.ENOENT)
+        if probe.connect_ex(str(path)) in (errno.ECONNREFUSED, errno.ENOENT):
+            return None
+        return int(CREDENTIALS.unpack(probe.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, CREDENTIALS.size))[0])
 
 
 @contextlib.contextmanager

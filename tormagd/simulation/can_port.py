@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
-from tormagd.ground.files import is_left_socket
+from tormagd.ground.files import listener_of
 from tormagd.simulation.can_device import ERROR_FLAG, MAX_DATA, MAX_IDENTIFIER, CanDevice, CanFrame
 
 MAX_HOSTS = 8
@@ -132,5 +132,5 @@ def _remove_abandoned(path: Path) -> None:
     with contextlib.suppress(FileNotFoundError):
         if not stat.S_ISSOCK(path.lstat().st_mode):
             raise OSError("it is there and not a socket; name another path")
-        if is_left_socket(path):
+        if listener_of(path) is None:
             path.unlink()
