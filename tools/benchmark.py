@@ -23,8 +23,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run one measurement; return 0, or 2 on a wrong command line."""
     module, options = parsed("benchmarks", MEASUREMENTS, arguments)
     before_us = machine_us()
-    figures = module.measure(options)
-    return told(module, options, figures | {"machine_us": round((before_us + machine_us()) / 2.0, 1)})
+    return told(module, options, module.measure(options) | {"machine_us": round((before_us + machine_us()) / 2.0, 1)})
 
 
 if __name__ == "__main__":

@@ -82,7 +82,7 @@ def _row(result: Result) -> dict[str, Any]:
 
 
 def told(result: Result) -> str:
-    """Return a result as text: one line if the check passed, else what was sent, seen and expected."""
+    """Return a result as text: one line, or what was sent, seen and expected."""
     one = result.check
     if result.passed is False:
         return (
@@ -102,26 +102,35 @@ def _examined(line: Line, checks: Sequence[Check], options: argparse.Namespace) 
         reset=partial(_reset, options.reset) if options.reset else None,
         ask=lambda what: _say(f"please {what}", sys.stderr),
     )
+    results, ended = _performed(host, checks, out)
+    lost = _say(f"{options.line}: {_summary(host, results)}", out)
+    if options.json:
+        lost = _say(json.dumps(report(results), indent=2), sys.stdout)
+    elif isinstance(lost, BrokenPipeError):  # its reader meant to
+        lost = None
+    if lost:
+        _say(f"the results could not be written: {lost}", sys.stderr)
+    return not (ended or lost or any(result.passed is False for result in results))
 
-    def tell(result: Result) -> None:
-        _say(told(result), out)
 
+def _performed(host: Host, checks: Sequence[Check], out: TextIO | None) -> tuple[list[Result], str]:
+    """Tell and return the results, and why that ended early."""
+    results, ended = list[Result](), ""
     try:
-        try:
-            results = run(host, checks, tell)
-        except KeyboardInterrupt:  # a request to end ends the checks, but the gap is still opened
-            for number in (signal.SIGINT, signal.SIGTERM):
-                signal.signal(number, signal.SIG_IGN)
-            print("ended; opening the gap", file=sys.stderr, flush=True)
-            run(host, [left_open], tell)
-            return False
+        for result in run(host, checks):
+            results.append(result)
+            _say(told(result), out)
+    except KeyboardInterrupt:  # a request to end ends the checks, but the gap is still opened
+        for number in (signal.SIGINT, signal.SIGTERM):
+            signal.signal(number, signal.SIG_IGN)
+        _say("ended; opening the gap", sys.stderr)
+        opened, ended = _performed(host, [left_open], out)
+        results, ended = results + opened, ended or "it was ended before"
     except OSError as error:
-        print(f"the line is gone ({error}): by the page the device opens the gap by itself now", file=sys.stderr)
-        return False
-    _say(f"{options.line}: {_summary(host, results)}", out)
-    return (not options.json or _say(json.dumps(report(results), indent=2), sys.stdout)) and all(
-        result.passed is not False for result in results
-    )
+        ended = f"the line is gone ({error})"
+        _say(f"{ended}: by the page the device opens the gap by itself now", sys.stderr)
+    tried = [result.check for result in results]
+    return results + [Result(one, passed=None, seen=ended) for one in checks if one not in tried], ended
 
 
 def _summary(host: Host, results: Sequence[Result]) -> str:
@@ -141,11 +150,14 @@ def _reset(command: str, how: str) -> None:
         raise Unmet(f"--reset: {error}") from error
 
 
-def _say(text: str, out: TextIO) -> bool:
-    with contextlib.suppress(OSError):
+def _say(text: str, out: TextIO | None) -> OSError | None:
+    if out is None:
+        return OSError("the stream is closed")
+    try:
         print(text, file=out, flush=True)
-        return True
-    return False
+    except OSError as error:
+        return error
+    return None
 
 
 def _is_agreed(line: str) -> bool:

@@ -1,6 +1,6 @@
 """A check: what is sent, what the protocol page expects, and which hazard it bears on; and the running of checks."""
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator
 from enum import Enum
 from typing import Final, NamedTuple
 
@@ -49,17 +49,17 @@ def check(
     return lambda perform: Check(perform.__name__, hazard, page, sent, expected, perform, moves, is_gate)
 
 
-def run(host: Host, checks: Iterable[Check], tell: Callable[[Result], None] = lambda result: None) -> Sequence[Result]:
-    """Perform checks in order, hand each result to `tell`, and return all."""
-    results: list[Result] = []
+def run(host: Host, checks: Iterable[Check]) -> Iterator[Result]:
+    """Perform checks in order, and yield the result of each."""
     closed_by = ""
     for one in checks:
-        seen = f"not tried, because {closed_by} failed"
-        result = Result(one, passed=False, seen=seen) if one.moves and closed_by else _performed(host, one)
+        result = (
+            Result(one, passed=False, seen=f"not tried, because {closed_by} failed")
+            if one.moves and closed_by
+            else _performed(host, one)
+        )
         closed_by = closed_by or (one.name if one.is_gate and result.passed is False else "")
-        results.append(result)
-        tell(result)
-    return results
+        yield result
 
 
 def _performed(host: Host, one: Check) -> Result:

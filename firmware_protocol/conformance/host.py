@@ -194,8 +194,7 @@ class Host:
         unless(not is_shown, f"{kind.__name__} not acknowledged before its repetition: {shown(self.status)}")
         to, nonce = LEADS_TO[kind], self.status.command_nonce
         came = next(each for _, each in self.all_of(Status)[before:] if each.command_nonce == nonce or each.mode is to)
-        is_wrong = came.mode is not to or came.command_nonce != nonce
-        unless(is_wrong, f"{kind.__name__} acknowledged with {shown(came)}")
+        unless(came.mode is not to or came.command_nonce != nonce, f"{kind.__name__} acknowledged with {shown(came)}")
 
     def beat(
         self,

@@ -51,8 +51,9 @@ def test_pause_holds_resume_goes_on_and_disable_opens(armed: ClosedLoop, render)
 def test_setpoints_wait_for_the_next_plan_where_the_rate_binds(arm: Callable[..., ClosedLoop], is_every, planned):
     rates = Rates(control_hz=500, inference_hz=100, plan_every_setpoint=is_every)
     config = Config(rates=rates)
-    loop = arm("sample_1", core=build_core(config), config=config)
-    samples = list(loop.run(1.0, lambda now_s: TimedSetpoint(1.0, now_s, 0.1)))
+    samples = list(
+        arm("sample_1", core=build_core(config), config=config).run(1.0, lambda now_s: TimedSetpoint(1.0, now_s, 0.1))
+    )
     assert len({sample.plan.time_s for sample in samples}) == pytest.approx(planned, abs=1)
     assert samples[-1].plan.stamp_s > samples[-1].time_s - 0.011
 

@@ -304,5 +304,6 @@ class Together(RuleBasedStateMachine):
 @pytest.mark.long
 @pytest.mark.usefixtures("library")
 def test_whatever_happens_to_both_nothing_moves_unarmed_and_every_fault_has_a_way_out() -> None:
-    examples = settings().max_examples // 6
-    run_state_machine_as_test(Together, settings=settings(max_examples=examples, stateful_step_count=25))
+    run_state_machine_as_test(
+        Together, settings=settings(max_examples=settings().max_examples // 6, stateful_step_count=25)
+    )

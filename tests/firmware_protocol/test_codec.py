@@ -281,8 +281,9 @@ def test_the_crcs_of_the_readmes_examples_are_over_what_it_says() -> None:
     checked = re.findall(r"^\| `([0-9a-f ]+)` \| CRC-(8|16) over `([0-9a-f ]+)` \|$", PAGE, re.MULTILINE)
     assert len(checked) == 3
     for crc, width, data in checked:
-        expected = bitwise_crc8 if width == "8" else bitwise_crc16
-        assert int.from_bytes(bytes.fromhex(crc), "big") == expected(bytes.fromhex(data))
+        assert int.from_bytes(bytes.fromhex(crc), "big") == (bitwise_crc8 if width == "8" else bitwise_crc16)(
+            bytes.fromhex(data)
+        )
 
 
 def test_the_readme_says_which_way_round_the_schema_hash_is() -> None:
@@ -327,8 +328,7 @@ def test_c_sends_no_step_out_of_range_and_no_unknown_function(
 ) -> None:
     """Every byte of the signals is `step`; a mode of 255 is none."""
     payload, length = ctypes.create_string_buffer(MAX_PAYLOAD), ctypes.c_size_t()
-    message = bytes((function,)) + bytes((step,)) * 63
-    assert library.tormag_encode(payload, ctypes.byref(length), message) == result
+    assert library.tormag_encode(payload, ctypes.byref(length), bytes((function, *[step] * 63))) == result
 
 
 def test_under_sanitizers_c_frames_the_golden_payloads(exchange) -> None:

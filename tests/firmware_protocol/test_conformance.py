@@ -124,7 +124,7 @@ UNTESTED = {one.name for one in BY_HAND}
 
 
 def passed(line: Line, checks: Sequence[Check] = CHECKS) -> set[str]:
-    results = run(hosted(line), checks)
+    results = list(run(hosted(line), checks))
     assert {result.check.name for result in results if result.passed is None} <= UNTESTED
     assert [(result.check.name, result.seen) for result in results if result.passed is False] == []
     assert results[-1].check is left_open
@@ -1233,7 +1233,7 @@ def test_what_the_kit_damages_is_no_frame() -> None:
 
 @pytest.mark.parametrize("planted", PLANTED, ids=lambda planted: f"{planted.error}-{planted.finds}")
 def test_a_planted_error_is_found_by_name(planted: Planted) -> None:
-    result = run(hosted(planted.line()), [named(name) for name in (*planted.first, planted.finds)])[-1]
+    *_, result = run(hosted(planted.line()), [named(name) for name in (*planted.first, planted.finds)])
     assert (result.check.name, result.passed) == (planted.finds, False), result.seen
     assert SAID.get(planted.error, "") in result.seen
 
@@ -1243,8 +1243,7 @@ def test_every_check_finds_an_error() -> None:
 
 
 def test_a_device_that_cannot_be_met_is_not_moved() -> None:
-    line = by_error("another hash")
-    results = {result.check.name: result for result in run(Host(line), CHECKS)}
+    results = {result.check.name: result for result in run(Host(by_error("another hash")), CHECKS)}
     assert results["clock_runs_on"].passed
     assert {results[one.name].seen for one in CHECKS if one.moves} == {
         "not tried, because identity_answers_hello failed"
@@ -1329,7 +1328,7 @@ MOVING = (*3 * ("home_homes",), "left_duty", "run_retract", "duties_make_current
 def test_what_this_computer_or_the_hand_spoiled_is_not_the_devices(
     line: Callable[[], Line], names: tuple[str, ...], passed: bool | None, says_late: bool
 ) -> None:
-    result = run(Host(line()), [named(name) for name in names])[-1]
+    *_, result = run(Host(line()), [named(name) for name in names])
     assert (result.passed, "ms late meanwhile" in result.seen) == (passed, says_late), result.seen
 
 
@@ -1444,20 +1443,29 @@ def test_an_interrupted_run_leaves_the_gap_open(ran: Callable[..., int], capsys:
 
 
 def test_a_line_that_goes_is_told_and_no_success(ran: Callable[..., int], capsys: pytest.CaptureFixture[str]) -> None:
-    assert ran(serial_line(wire=wrong(Interrupted, error=OSError)), "--yes", "--only", "run_drive_off") == 1
-    assert "the line is gone" in capsys.readouterr().err
+    line = serial_line(wire=wrong(Interrupted, error=OSError))
+    assert ran(line, "--yes", "--json", "--only", "every_counter", "--only", "run_drive_off") == 1
+    out, err = capsys.readouterr()
+    assert "the line is gone (gone): by the page" in err
+    names = {kind: [one["name"] for one in found] for kind, found in json.loads(out).items()}
+    assert names == {"checks": ["every_counter"], "untested": ["run_drive_off", "left_open"]}
 
 
-@pytest.mark.parametrize(("options", "code"), [((), 0), (("--json",), 1)], ids=["text", "the report is lost"])
+class Unread(io.StringIO):
+    def write(self, text: str) -> int:
+        raise BrokenPipeError
+
+
+@pytest.mark.parametrize(
+    ("options", "out", "code"),
+    [((), Unread(), 0), (("--json",), Unread(), 1), ((), None, 1), (("--json",), None, 1)],
+    ids=["text", "the report is lost", "closed", "closed to the report"],
+)
 def test_a_reader_that_goes_does_not_end_the_run(
-    monkeypatch: pytest.MonkeyPatch, ran: Callable[..., int], options: tuple[str, ...], code: int
+    monkeypatch: pytest.MonkeyPatch, ran: Callable[..., int], options: tuple[str, ...], out: Unread | None, code: int
 ) -> None:
-    class Closed(io.StringIO):
-        def write(self, text: str) -> int:
-            raise BrokenPipeError
-
     device = VirtualDevice(NEAR_HOME, SteadyHand())
-    monkeypatch.setattr(sys, "stdout", Closed())
+    monkeypatch.setattr(sys, "stdout", out)
     assert ran(SerialLine(Wire(device)), "--yes", "--only", "run_drive_off", *options) == code
     assert device.messages.firmware.mode is DeviceMode.IDLE
 

@@ -301,8 +301,10 @@ def test_a_full_queue_is_borne_for_as_long_as_the_device_would(failing: Callable
 def test_other_kinds_of_frames_are_other_peoples(failing: Callable[..., CanBackend], flag: str) -> None:
     identifier, data = STATUS_FRAME.identifier, STATUS_FRAME.data
     flags = {"is_extended_id": False, "data": b"" if flag == "is_remote_frame" else data} | {flag: True}
-    other = can.Message(arbitration_id=identifier, **flags)
-    backend = failing(other, can.Message(arbitration_id=identifier, data=data, is_extended_id=False))
+    backend = failing(
+        can.Message(arbitration_id=identifier, **flags),
+        can.Message(arbitration_id=identifier, data=data, is_extended_id=False),
+    )
     assert (backend.receive() + backend.receive(), backend.stream.statistics.corrupt) == ([STATUS], 0)
 
 

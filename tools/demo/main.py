@@ -93,8 +93,7 @@ def main() -> int:
     print("The same pulse in virtual time, on the other plant samples:")
     rehearsals = rehearse_all(config, times_s, forces_N)
     print("The same pulse, its field searched as it was ordered, in real time:")
-    ordered = show_ordered()
-    return conclude(scene, touched, shown, rehearsals, ordered, verdict, sentence)
+    return conclude(scene, touched, shown, rehearsals, show_ordered(), verdict, sentence)
 
 
 def judge(scene: Scene, shown: Shown | Aborted) -> tuple[Verdict, str]:

@@ -46,7 +46,7 @@ def write_in_any_encoding() -> None:
 def write_line(text: str, stream: TextIO | None) -> OSError | None:
     """Write `text`, escaped, with a line end; return the error that prevented it."""
     if stream is None:
-        return None
+        return OSError(0, "the stream is closed")
     try:
         print(escaped(text), file=stream, flush=True)
     except OSError as error:

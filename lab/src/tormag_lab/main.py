@@ -66,9 +66,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
     commands = [f"  {each:20}{summary}" for each, (_, summary) in COMMANDS.items()]
     usage = ["usage: tormag-lab NAME [--help] ...", "       tormag-lab --version", "", *commands]
     told = {"--version": [f"tormag-lab {__version__}"], "-h": usage, "--help": usage}
+    if name in told:
+        return 0 if write_answer("\n".join(told[name]), "tormag-lab") else NOT_TOLD
     refused = f"tormag-lab: no command {in_short(name)}{did_you_mean(name, COMMANDS) or '; there are:'}"
-    write_line("\n".join(told.get(name, [refused, *commands])), sys.stdout if name in told else sys.stderr)
-    return 0 if name in told else USAGE
+    write_line("\n".join([refused, *commands]), sys.stderr)
+    return USAGE
 
 
 def run(name: str, arguments: Sequence[str]) -> int:

@@ -41,8 +41,7 @@ def write_page(path: Path, sections: Iterable[str], folder: Path, pictures: Mapp
 
 def table(columns: Iterable[str], rows: Iterable[Iterable[str]]) -> str:
     head = list(columns)
-    lines = [head, ["---"] * len(head), *rows]
-    return "".join(f"| {' | '.join(line)} |\n" for line in lines)
+    return "".join(f"| {' | '.join(line)} |\n" for line in [head, ["---"] * len(head), *rows])
 
 
 def percent(share: float) -> str:

@@ -40,8 +40,9 @@ def known(planner, hear, moving):
 
 @pytest.mark.parametrize("share", [1.0, 0.95, 0.89])
 def test_readings_that_fall_are_followed_within_the_leash(known, hear, moving, share: float) -> None:
-    believe = hear(known, 2.0, moving(force_N=share * MODEL_N)).believe
-    assert force_N(believe) == pytest.approx(share * MODEL_N, abs=0.01)
+    assert force_N(hear(known, 2.0, moving(force_N=share * MODEL_N)).believe) == pytest.approx(
+        share * MODEL_N, abs=0.01
+    )
     assert known.planned.limits == ()
 
 
@@ -52,8 +53,7 @@ def test_readings_that_fall_further_are_followed_to_its_end_or_not_at_all_and_na
     known, hear, moving, share: float, end_N: float
 ) -> None:
     for _ in range(5):
-        believe = hear(known, 1.0, moving(force_N=share * MODEL_N)).believe
-        assert force_N(believe) > end_N - 0.01
+        assert force_N(hear(known, 1.0, moving(force_N=share * MODEL_N)).believe) > end_N - 0.01
     assert {Limit.DEVICE_OR_SENSOR, Limit.SENSOR} & set(known.planned.limits)
 
 
@@ -138,8 +138,9 @@ def test_without_a_dispute_there_is_nothing_to_confirm(known) -> None:
 def test_a_device_that_has_not_slid_is_learned_within_the_bounds(
     planner, hear, moving, share: float, is_learned: bool
 ) -> None:
-    believe = hear(planner, 1.0, moving(force_N=share * MODEL_N)).believe
-    assert (force_N(believe) == pytest.approx(share * MODEL_N, abs=0.03)) is is_learned
+    assert (
+        force_N(hear(planner, 1.0, moving(force_N=share * MODEL_N)).believe) == pytest.approx(share * MODEL_N, abs=0.03)
+    ) is is_learned
     assert (Limit.SENSOR in planner.planned.limits) is not is_learned
 
 

@@ -42,8 +42,7 @@ def main() -> int:
     parser.add_argument("--cpu", type=int, required=True, help="the processor it stays on")
     parser.add_argument("--fifo", type=int, default=0, help="SCHED_FIFO priority; 0, or refused: ordinary scheduling")
     options = parser.parse_args()
-    realtime = RealTime(fifo_priority=options.fifo, cpus=(options.cpu,))
-    print(json.dumps(uvloop.run(stalls_until_ended(realtime))))
+    print(json.dumps(uvloop.run(stalls_until_ended(RealTime(fifo_priority=options.fifo, cpus=(options.cpu,))))))
     return 0
 
 

@@ -209,8 +209,7 @@ def figure_2_7(tests: list[StepTest]) -> Json:
     """Return the simulated device's settled forces beside the force law, and all inserts' ranges."""
     rows = []
     for test in tests:
-        brake = Brake.as_built(insert(test.insert).elastomer)
-        analytic_N = brake.force_N(test.level_gap_mm)
+        analytic_N = Brake.as_built(insert(test.insert).elastomer).force_N(test.level_gap_mm)
         rows.append(
             {
                 "insert": test.insert,
