@@ -26,13 +26,14 @@ from tormag_lab.ideal_carriage import (
 from tormag_lab.main import main
 from tormagd.config import Config
 from tormagd.control.assembly.build import build_core
+from tormagd.control.core import Stepper
 from tormagd.control.records import TimedSetpoint
 from tormagd.element.physics.relaxation import PronySeries
 from tormagd.simulation.closed_loop import ClosedLoop
 from tormagd.simulation.device import VirtualDevice
 from tormagd.simulation.element import TorqueElement
 from tormagd.simulation.hand import SteadyHand
-from tormagd.simulation.ideal_actuator import ideal_stepper
+from tormagd.simulation.ideal_actuator import IdealCarriages
 from tormagd.simulation.parameters import PlantParameters, load_plant
 from tormagd.simulation.plant import Plant
 from tormagd.simulation.second_element import SecondElement
@@ -218,7 +219,8 @@ def test_the_command_prints_its_figures(capsys, tmp_path) -> None:
 @pytest.mark.parametrize("command", ["pause", "disable"])
 def test_they_stand_where_nothing_is_planned_for(command: str) -> None:
     core, device = build_core(Config()), VirtualDevice(load_plant("sample_1"), SteadyHand(), seed=1)
-    loop = ClosedLoop(core.config, ideal_stepper(core, device.messages.plant), core.planner(), device)
+    stepper = Stepper(core.config, core.scene, move=IdealCarriages(core, device.messages.plant))
+    loop = ClosedLoop(core.config, stepper, core.planner(), device)
     loop.arm()
     list(loop.run(0.5, lambda now_s: TimedSetpoint(1.4, now_s, 0.1)))
     stood_mm = device.messages.truth.gap_mm

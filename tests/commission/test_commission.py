@@ -201,8 +201,9 @@ def test_weights_tell_the_sensors_gain_and_a_bent_line(bench, gain, bent_per_N, 
         hung_N = force_N + 1.0 * (now_s > 10.0) + second_N * (now_s > 25.0)
         return gain * hung_N * (1.0 + bent_per_N * hung_N)
 
-    hung = bench(SAMPLE, hand=SteadyHand(0.0), alters=through(weighs))
-    found, stopped = hung.commission(chosen("weight"), weight_N=1.0)
+    found, stopped = bench(SAMPLE, hand=SteadyHand(0.0), alters=through(weighs)).commission(
+        chosen("weight"), weight_N=1.0
+    )
     expected = [gain * (1.0 + bent_per_N), (1.0 + 3.0 * bent_per_N) / (1.0 + bent_per_N)][: 1 + (second_N > 0.0)]
     assert ([each.value for each in found["weight"]], stopped) == (pytest.approx(expected, abs=0.02), None)
     assert [each.is_fine for each in found["weight"]] == [abs(each - 1.0) < 0.05 for each in expected]

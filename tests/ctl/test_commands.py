@@ -238,8 +238,10 @@ def test_every_measured_way_is_shown_with_what_it_costs(fast, ctl, checked_here)
         (False, False),
     ]
     assert "10.0    105.0" in shown["cheap"]
-    words = ctl("scene", "explain", "pulse").ended(0).out
-    assert "The scene states 1000 / 500 Hz, nearest; 1000 / 500 Hz, newton serves it for" in words
+    assert (
+        "The scene states 1000 / 500 Hz, nearest; 1000 / 500 Hz, newton serves it for"
+        in ctl("scene", "explain", "pulse").ended(0).out
+    )
 
 
 @pytest.mark.parametrize(
@@ -561,8 +563,11 @@ def test_a_force_that_no_insert_renders_is_written_and_marked(
     tmp_path, ctl, checked_here, most_N, rate_hz, insert, parts
 ):
     out = tmp_path / "mine.toml"
-    forces = recording(tmp_path / "f.csv", 0.7, most_N, rate_hz)
-    result = ctl("scene", "new", str(out), "--force", str(forces), "--json").ended(1).result
+    result = (
+        ctl("scene", "new", str(out), "--force", str(recording(tmp_path / "f.csv", 0.7, most_N, rate_hz)), "--json")
+        .ended(1)
+        .result
+    )
     assert result["insert"] == insert
     assert all(any(part in line for line in result["unmet"]) for part in parts)
     head = " ".join(line.strip("# ") for line in out.read_text().partition("\n[")[0].splitlines())

@@ -535,8 +535,10 @@ def press(command: str) -> str:
 @needs_chromium
 async def test_stop_is_within_reach_and_everything_else_asks_first(fake_daemon: Any, tmp_path: Path) -> None:
     given = Given()
-    how = Operating(SECRET, given)
-    async with live(fake_daemon.directory) as shown, page_of(shown, tmp_path, 1440, 900, how) as page:
+    async with (
+        live(fake_daemon.directory) as shown,
+        page_of(shown, tmp_path, 1440, 900, Operating(SECRET, given)) as page,
+    ):
         await page.until("document.querySelector('#state')?.textContent === 'ENABLED'")
         for width, height in ((1440, 900), (1024, 768), (390, 844), (320, 480)):
             await page.resize(width, height)
@@ -590,8 +592,7 @@ async def test_axe_finds_nothing(fake_daemon: Any, recorded: Recorded, tmp_path:
 async def test_the_example_shows_the_stream(fake_daemon: Any, tmp_path: Path) -> None:
     text = (Path(__file__).parents[2] / "examples/live.html").read_text(encoding="utf-8")
     assert len(text.splitlines()) <= 15
-    made = web.Application()
-    async with live(fake_daemon.directory) as shown, TestServer(made) as own, browser(tmp_path) as page:
+    async with live(fake_daemon.directory) as shown, TestServer(web.Application()) as own, browser(tmp_path) as page:
         for origin, shows in ((str(own.make_url("/")).rstrip("/"), "1.50 N asked"), (None, "– N asked")):
             async with served(shown, origin=origin) as asks:
                 here = text.replace("127.0.0.1:8733", f"127.0.0.1:{asks.port}")

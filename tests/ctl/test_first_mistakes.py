@@ -2,6 +2,7 @@
 
 import errno
 import json
+import resource
 import shlex
 import shutil
 from pathlib import Path
@@ -104,7 +105,9 @@ MISTAKES: list[tuple[str, int, str | tuple[str, ...], dict[str, str]]] = [
     ("tormagctl calibrate --motors --out there", 2, "--out there: allowed is a new file", {"there": "precious"}),
     ("tormagctl calibrate --insert A --out none/m.csv", 2, "--out none/m.csv: allowed is a new file in a folder", {}),
     ("tormagctl calibrate --insert A --out m.csv", 2, "--yes", {}),
-    ("tormagctl record nowhere", 2, "nowhere: no such folder", {}),
+    ("tormagctl record nowhere", 2, "nowhere: No such file or directory", {}),
+    ("tormagctl record /dev/full", 2, "/dev/full: Not a directory", {}),
+    ("tormagctl recordings list /dev/full", 2, "/dev/full: Not a directory", {}),
     ("tormagctl keys generate", 2, "the following arguments are required: DIR", {}),
     ("tormagctl keys show /nowhere/a.key", 2, "/nowhere/a.key", {}),
     ("tormagctl keys show a.key", 2, "a.key", {"a.key": "no key"}),
@@ -225,6 +228,16 @@ def test_a_mistake_is_answered_in_a_sentence(command, code, says, files, tmp_pat
     assert [line for line in more if not line.startswith("  ")] == []
     assert "  next: " in said or command.startswith("tormagd --check")
     assert {path.name: path.read_text(encoding="utf-8") for path in tmp_path.iterdir()} == files
+
+
+@pytest.mark.parametrize(("command", "most", "code"), [("status", 31, 1), ("stop", 9, 1), ("stop", 31, 3)])
+def test_too_few_open_files_are_told_and_to_open_the_gap_fewer_will_do(
+    command, most, code, tmp_path, monkeypatch, capsys
+):
+    monkeypatch.setattr(resource, "getrlimit", lambda _: (most, most))
+    monkeypatch.setattr(resource, "setrlimit", Mock())
+    assert ctl.main(["--endpoint", f"ipc://{tmp_path}/control", "--wait", "0.05", command]) == code
+    assert (f"the hard limit of open files is {most}" in capsys.readouterr().err) is (code == 1)
 
 
 JSON = [row for row in MISTAKES if row[0].startswith("tormagctl") and "--measure" not in row[0]]

@@ -9,6 +9,7 @@ import pytest
 
 from tormagd.config import RealTime
 from tormagd.daemon import admission, realtime
+from tormagd.ground.files import raise_open_files
 
 pytestmark = pytest.mark.usefixtures("usual_slices")
 REFUSED = PermissionError(1, "Operation not permitted")
@@ -40,11 +41,11 @@ def test_as_many_files_as_the_kernel_allows_may_be_open_or_nothing_starts(
     set_limit = Mock()
     monkeypatch.setattr(resource, "setrlimit", set_limit)
     monkeypatch.setattr(resource, "getrlimit", lambda _: (soft, 4_096))
-    realtime.raise_open_files()
+    raise_open_files(1_024)
     set_limit.assert_called_once_with(resource.RLIMIT_NOFILE, (4_096, 4_096))
     monkeypatch.setattr(resource, "getrlimit", lambda _: (512, 1_023))
     with pytest.raises(OSError, match=r"^the hard limit of open files is 1023: allowed is 1024 or more; raise Limit"):
-        realtime.raise_open_files()
+        raise_open_files(1_024)
 
     assert 100 + len(admission.MAY) * (admission.CONNECTIONS + admission.CLOSING + 1) < realtime.OPEN_FILES
 

@@ -74,5 +74,6 @@ def test_a_motor_log_becomes_a_motor(here: Path, capsys: pytest.CaptureFixture[s
     noise = np.random.default_rng(0).normal(0.0, 0.02, len(time_s))
     savemat("DATA_EMPS.mat", {"t": time_s, "qm": position_m, "vir": volts + noise, "gtau": 35.0})
     run("tune.md", "--json")
-    found = msgspec.json.decode(capsys.readouterr().out)["parameters"]
-    assert found["mass_kg"]["value"] == pytest.approx(95.0, rel=0.03)
+    assert msgspec.json.decode(capsys.readouterr().out)["parameters"]["mass_kg"]["value"] == pytest.approx(
+        95.0, rel=0.03
+    )

@@ -45,8 +45,10 @@ def wrench(force_N=0.0, sec=0, nanosec=0):
 
 
 def test_a_wrench_along_the_shaft_is_a_setpoint_for_the_time_of_its_header():
-    fields = translation.setpoint_of(wrench(1.4, 1_800_000_000, 5))
-    setpoint = decode(Numbering("ros2").setpoint(valid_for_ms=100.0, **fields), Setpoint)
+    setpoint = decode(
+        Numbering("ros2").setpoint(valid_for_ms=100.0, **translation.setpoint_of(wrench(1.4, 1_800_000_000, 5))),
+        Setpoint,
+    )
     assert (setpoint.servo_cf, setpoint.stamp_ns) == (1.4, 1_800_000_000_000_000_005)
     assert translation.setpoint_of(wrench(1.4))["stamp_ns"] is None
 

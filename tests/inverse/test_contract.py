@@ -155,9 +155,8 @@ def test_on_a_model_that_falls_again_the_branch_is_kept(name: str) -> None:
 @pytest.mark.parametrize("name", CONTINUOUS)
 def test_without_a_last_field_the_lowest_root_wins(name: str) -> None:
     force = BUMP.predict_one(0.5, 10, 300.0, CIP)
-    accuracy = SUBJECTS[name].accuracy_mT
     assert solver(name, BUMP).solve(BUMP.curve(0.5, 10, CIP), force, None).field_mT == pytest.approx(
-        300, abs=10 * accuracy
+        300, abs=10 * SUBJECTS[name].accuracy_mT
     )
 
 
@@ -457,6 +456,9 @@ def test_no_other_search_without_torch_is_worth_its_price() -> None:
 
 
 def test_a_scene_may_name_its_search() -> None:
-    scene = load_scene(shipped_scenes()[0])
-    choice = choose_solver(msgspec.structs.replace(scene, solver=Solver(name="nearest", step_mT=5.0, neighbours=2)))
+    choice = choose_solver(
+        msgspec.structs.replace(
+            load_scene(shipped_scenes()[0]), solver=Solver(name="nearest", step_mT=5.0, neighbours=2)
+        )
+    )
     assert (choice.solver, choice.step_mT, choice.neighbours) == ("nearest", 5.0, 2)

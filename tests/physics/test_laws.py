@@ -149,8 +149,9 @@ def test_arrays_keep_type_and_shape_and_agree_with_floats(
     points = np.linspace(low, high, 12).astype(dtype).reshape(3, 4)
     values = law(points)
     assert (values.dtype, values.shape) == (dtype, points.shape)
-    expected = [law(float(one)) for one in points.ravel()]
-    np.testing.assert_allclose(values.ravel(), expected, rtol=digits * np.finfo(dtype).eps)
+    np.testing.assert_allclose(
+        values.ravel(), [law(float(one)) for one in points.ravel()], rtol=digits * np.finfo(dtype).eps
+    )
     assert isinstance(law(0.5 * (low + high)), float)
 
 

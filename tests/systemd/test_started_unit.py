@@ -67,8 +67,7 @@ def put(machine, path: str, text: str) -> None:
 def files(machine) -> set[str]:
     """Return everything of ours that package or service have written."""
     found = machine.run("find", "/opt/written", "/run", "-path", "*tormag*").splitlines()
-    paths = {path.removeprefix("/opt/written") for path in found}
-    return {path for path in paths if not path.startswith(OTHERS)}
+    return {path for path in {path.removeprefix("/opt/written") for path in found} if not path.startswith(OTHERS)}
 
 
 def shown(section: str) -> str:

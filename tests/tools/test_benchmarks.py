@@ -174,8 +174,7 @@ def test_the_first_tick_that_used_a_setpoint_counts() -> None:
 
 def test_stages_add_up_to_the_whole() -> None:
     # sent, written by the wall clock; the beat's time until then
-    ticks = [(1_000_000, 1_960_000, 60.0), (3_000_000, 3_570_000, 70.0)]
-    found_us = latency.stages(ticks)
+    found_us = latency.stages([(1_000_000, 1_960_000, 60.0), (3_000_000, 3_570_000, 70.0)])
     assert {name: each_us.tolist() for name, each_us in found_us.items()} == {
         latency.WHOLE: [960.0, 570.0],
         "sent, until its beat begins": [900.0, 500.0],

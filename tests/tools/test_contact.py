@@ -56,8 +56,11 @@ class Trembling:
 
 
 def test_a_tremor_changes_no_way() -> None:
-    core = core_of(Case("sample_1", 0.3, 0.25, 30.0, 0.0, "way"))
-    loop = armed(core, device("sample_1"), FeltHand(Trembling(), Impedance(0.15, 0.3, 0.01)))
+    loop = armed(
+        core_of(Case("sample_1", 0.3, 0.25, 30.0, 0.0, "way")),
+        device("sample_1"),
+        FeltHand(Trembling(), Impedance(0.15, 0.3, 0.01)),
+    )
     run = loop.run(15.5 - loop.now_s, lambda now_s: TimedSetpoint(1.5, now_s, VALID_S, withdraw_N=0.5))
     kinetic_N = [sample.truth.kinetic_N for sample in run if sample.time_s > 13.5]
     assert max(kinetic_N) - min(kinetic_N) < 0.1

@@ -270,7 +270,6 @@ def test_a_wall_that_is_never_felt_is_told_as_that() -> None:
 
 def test_a_fault_of_the_hands_show_is_told_as_the_pulses_and_decides_nothing(tmp_path, undrawn) -> None:
     early = aborted("MEASUREMENT_STALE", STALLED)
-    sentence = demo.judge(SCENE, early)[1]
-    assert demo.touch_told(SCENE, early) == [sentence]
+    assert demo.touch_told(SCENE, early) == [demo.judge(SCENE, early)[1]]
     assert demo.conclude(SCENE, early, shown(), rehearsals(), {}, MET, "") == 0
     assert not (tmp_path / "touch.png").exists()

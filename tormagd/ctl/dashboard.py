@@ -74,8 +74,7 @@ async def _give(endpoints: Endpoints, wait_s: float, command: str) -> str:
     begun_s = time.monotonic()
     async with AsyncClient(endpoints, wait_s) as client:
         if command == "arm":
-            given = await client.arm(told=report_step)
-            return armed(given, await client.status(), time.monotonic() - begun_s).text
+            return armed(await client.arm(told=report_step), await client.status(), time.monotonic() - begun_s).text
         outcome = done(command, await client.request(command))
     if outcome.exit_code is not Exit.DONE:
         raise CommandError(outcome.exit_code, "not_done", outcome.text, "")

@@ -18,6 +18,8 @@ from tormagd import __version__
 from tormagd.config import Config, load_config, load_endpoints
 from tormagd.ctl.commands import COMMANDS, FIRST_WORDS, GROUPS, SHARED, USUAL
 from tormagd.ctl.outcome import (
+    CommandError,
+    Exit,
     Outcome,
     as_usage_error,
     exit_code,
@@ -26,6 +28,7 @@ from tormagd.ctl.outcome import (
     usage_error,
 )
 from tormagd.ground.command_line import Parser, UsageError, add
+from tormagd.ground.files import raise_open_files
 from tormagd.ground.terminal import write_in_any_encoding, write_line
 from tormagd_client.endpoints import ENDPOINTS, ConfigError, Endpoints
 from tormagd_client.errors import ClientError
@@ -40,6 +43,8 @@ EXTRAS = {
     "foxglove": "foxglove",
     "prometheus_client": "metrics",
 }
+OPEN_FILES, OF_OPENING = 32, 10
+"libzmq aborts with fewer."
 SERVICE_CONFIG = Path("/etc/tormag/tormagd.toml")
 EXIT_TEXT = """exit codes: 0 done, 1 refused or not done (doctor: a failure was found), 2 usage, 3 daemon not reachable,
 4 device in FAULT. With --json stdout carries one object: {command, ok, result, error}."""
@@ -80,6 +85,7 @@ def _run(options: argparse.Namespace) -> Outcome:
         "wait_s": options.wait,
         "as_json": options.json,
     }
+    _raise_open_files(options.command)
     with contextlib.ExitStack() as stack:
         if command.has_daemon:
             with as_usage_error(
@@ -98,6 +104,13 @@ def _run(options: argparse.Namespace) -> Outcome:
             known["client"] = stack.enter_context(Client(known["endpoints"], options.wait))
         given = {key: value for key, value in vars(options).items() if key not in ("command", "in_group", *USUAL)}
         return _called(name, given | {need: known[need] for need in command.needs})
+
+
+def _raise_open_files(command: str) -> None:
+    try:
+        raise_open_files(OF_OPENING if command in ("stop", "disable") else OPEN_FILES)
+    except OSError as error:
+        raise CommandError(Exit.REFUSED, "open_files", str(error), f"ulimit -n {OPEN_FILES}") from error
 
 
 def _called(command: str, arguments: dict[str, Any]) -> Outcome:

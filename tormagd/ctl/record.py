@@ -73,7 +73,8 @@ def listening(
 def record(config: Config, endpoints: Endpoints, path: Path, duration_s: float, wait_s: float) -> Outcome:
     """Record for `duration_s` or until SIGINT or SIGTERM, to a file, or to segments in a folder."""
     if not (is_folder := path.is_dir()) and path.suffix != ".mcap":
-        raise usage_error(f"{path}: no such folder", f"mkdir -p {path}; the name of a file ends in .mcap")
+        with as_usage_error(OSError, hint="name a folder that is there, or a new file that ends in .mcap"):
+            list(path.iterdir())
     with listening(endpoints) as ticks, interrupted_by(signal.SIGINT, signal.SIGTERM) as is_interrupted:
         if not _is_ready(ticks, wait_s, is_interrupted):
             raise unreachable(endpoints.recording, f"nothing is published there within {wait_s:g} s")
@@ -175,8 +176,8 @@ def recordings(config: Config, action: str, path: Path | None, target: Path | No
     with as_usage_error(OSError, ValueError, hint="tormagctl recordings --help"):
         if action in ("list", "prune"):
             folder = RecordingFolder(path or Path(config.recordings.folder), config.recordings)
-            if not folder.path.is_dir():
-                raise usage_error(f"{folder.path}: no such folder", "name the folder, or set [recordings] folder")
+            with as_usage_error(OSError, hint="name the folder, or set [recordings] folder"):
+                list(folder.path.iterdir())
             return _list(folder) if action == "list" else _prune(folder)
         if path is None:
             raise usage_error(f"{action}: no recording is named", f"tormagctl recordings {action} FILE.mcap")

@@ -37,8 +37,9 @@ def list_scenes() -> Outcome:
 
 def show_scene(config: Config, name: str | None) -> Outcome:
     """Return everything a scene states, defaults included, as TOML."""
-    stated = msgspec.to_builtins(loaded(name or config.scene))
-    tables = {key: value for key, value in stated.items() if value is not None}
+    tables = {
+        key: value for key, value in msgspec.to_builtins(loaded(name or config.scene)).items() if value is not None
+    }
     return Outcome(tables, as_toml(tables))
 
 

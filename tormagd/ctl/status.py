@@ -236,8 +236,7 @@ def _late_ticks(blamed: Mapping[str, int]) -> list[str]:
 def firmware(client: Client) -> Outcome:
     """Report the daemon's link, with the keys of `link` in the status."""
     result = client.request("status")
-    known = understood(result, Status).link
-    return Outcome(result["link"], folded(firmware_text(known, Colour(sys.stdout))))
+    return Outcome(result["link"], folded(firmware_text(understood(result, Status).link, Colour(sys.stdout))))
 
 
 def firmware_text(link: LinkReport, colour: Colour) -> str:

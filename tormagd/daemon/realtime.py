@@ -34,15 +34,6 @@ _libc = ctypes.CDLL(None, use_errno=True)
 log = logging.getLogger(__name__)
 
 
-def raise_open_files() -> None:
-    _, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
-    if hard != resource.RLIM_INFINITY and hard < OPEN_FILES:
-        raise OSError(
-            f"the hard limit of open files is {hard}: allowed is {OPEN_FILES} or more; raise LimitNOFILE, or ulimit -Hn"
-        )
-    resource.setrlimit(resource.RLIMIT_NOFILE, (hard, hard))
-
-
 def prepare(settings: RealTime) -> list[str]:
     """Ask the kernel for these settings; return what it refused, a line each."""
     refused = []

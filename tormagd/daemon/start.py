@@ -16,9 +16,10 @@ from tormagd.control.assembly.build import STANDBY_N, Core, build_core, least_re
 from tormagd.daemon.black_box import BlackBox, header
 from tormagd.daemon.daemon import Daemon
 from tormagd.daemon.profiles import state_folder
-from tormagd.daemon.realtime import prepare, raise_open_files
+from tormagd.daemon.realtime import OPEN_FILES, prepare
 from tormagd.daemon.search_process import SearchProcess
 from tormagd.ground.access_keys import KeyRing
+from tormagd.ground.files import raise_open_files
 from tormagd.ground.terminal import write_answer, write_line
 from tormagd.ground.toml_file import placed
 from tormagd.hardware.backend import Backend, choose, installed
@@ -76,7 +77,7 @@ async def _run(
     options: argparse.Namespace,
 ) -> None:
     """Start the processes beside it, make this thread a real-time one, and run the daemon to its end."""
-    raise_open_files()
+    raise_open_files(OPEN_FILES)
     # before this thread becomes a real-time one: child processes would inherit its processors
     folder = state_folder(config.black_box.folder, "blackbox")
     box = BlackBox(folder, header(config, core), config.rates.control_hz)

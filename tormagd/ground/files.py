@@ -6,6 +6,7 @@ Only a regular file is read or replaced. What is written replaces it in one step
 import contextlib
 import errno
 import os
+import resource
 import socket
 import struct
 from collections.abc import Iterable, Iterator
@@ -77,6 +78,15 @@ def _whole_or_gone(written: Path, path: Path) -> Iterator[None]:
         if isinstance(error, OSError) and error.errno and ours in (error.filename or ours, error.filename2):
             error.filename = str(path)
         raise
+
+
+def raise_open_files(least: int) -> None:
+    _, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    if hard != resource.RLIM_INFINITY and hard < least:
+        raise OSError(
+            f"the hard limit of open files is {hard}: allowed is {least} or more; raise LimitNOFILE, or ulimit -Hn"
+        )
+    resource.setrlimit(resource.RLIMIT_NOFILE, (hard, hard))
 
 
 def shipped(folder: Traversable, ending: str) -> tuple[str, ...]:

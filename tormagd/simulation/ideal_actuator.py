@@ -8,7 +8,6 @@ import math
 from typing import Final, final
 
 from tormagd.control.assembly.build import Core
-from tormagd.control.core import Stepper
 from tormagd.control.move.actuator import Actuator, Drive, Reference, target_of
 from tormagd.control.records import Measured, Plan
 from tormagd.control.safety.codes import Limit
@@ -60,7 +59,3 @@ class IdealCarriages(Actuator):
         put_gap(self._plant, gap_mm)
         self.reference = Reference(gap_mm, (gap_mm - before_mm) / dt_s)
         return Drive(0.0, 0.0, 0.0, 0.0, () if gap_mm == wanted_mm else (Limit.RATE,))
-
-
-def ideal_stepper(core: Core, plant: Plant) -> Stepper:
-    return Stepper(core.config, core.scene, move=IdealCarriages(core, plant))
