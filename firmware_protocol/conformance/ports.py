@@ -48,8 +48,8 @@ class SerialPort(RealPort):
         try:
             self._port = serial.Serial(path, baud, timeout=0, write_timeout=PATIENCE_S, exclusive=True)
             self._port.reset_input_buffer()
-        except termios.error as error:  # not an OSError; unplugged while it was set up
-            raise OSError(f"{path}: {error.args[-1]}") from error
+        except (OSError, termios.error) as error:  # unplugged while it was set up, too
+            raise OSError(f"{path}: {_why(error)}") from error
         # USB serial chips hold bytes back for 16 ms by default; a pty has no such mode
         with contextlib.suppress(OSError, ValueError, NotImplementedError):
             self._port.set_low_latency_mode(True)
@@ -92,7 +92,7 @@ class CanPort(RealPort):
             OSError,
             NotImplementedError,
         ) as error:
-            raise OSError(f"{interface}:{channel}: cannot be opened: {error}") from error
+            raise OSError(f"{interface}:{channel}: cannot be opened: {_why(error)}") from error
 
     def write(self, identifier: int, data: bytes) -> None:
         try:
@@ -113,6 +113,10 @@ class CanPort(RealPort):
         if frame is None or frame.is_error_frame or frame.is_extended_id or frame.is_remote_frame or frame.is_fd:
             return []
         return [(frame.arbitration_id, bytes(frame.data))]
+
+
+def _why(error: Exception) -> str:
+    return "allowed is a serial port; this is none" if os.strerror(errno.ENOTTY) in str(error) else str(error)
 
 
 def open_line(name: str, baud: int, bitrate: int, node: int) -> Line:

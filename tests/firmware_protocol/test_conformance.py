@@ -1398,6 +1398,8 @@ def test_nothing_is_sent_before_somebody_agrees(
     ("arguments", "said"),
     [
         (["/nonexistent/port", "--yes"], "/nonexistent/port"),
+        (["/dev/null", "--yes"], "/dev/null: allowed is a serial port; this is none"),
+        (["slcan:/dev/null", "--yes"], "slcan:/dev/null: cannot be opened: allowed is a serial port; this is none"),
         (["telepathy:0", "--yes"], "telepathy"),
         (["tormagsim:/nonexistent/can", "--yes"], "cannot be opened"),
         ([], "PORT|CHANNEL"),
@@ -1443,8 +1445,18 @@ def test_an_interrupted_run_leaves_the_gap_open(ran: Callable[..., int], capsys:
 
 
 def test_a_line_that_goes_is_told_and_no_success(ran: Callable[..., int], capsys: pytest.CaptureFixture[str]) -> None:
-    line = serial_line(wire=wrong(Interrupted, error=OSError))
-    assert ran(line, "--yes", "--json", "--only", "every_counter", "--only", "run_drive_off") == 1
+    assert (
+        ran(
+            serial_line(wire=wrong(Interrupted, error=OSError)),
+            "--yes",
+            "--json",
+            "--only",
+            "every_counter",
+            "--only",
+            "run_drive_off",
+        )
+        == 1
+    )
     out, err = capsys.readouterr()
     assert "the line is gone (gone): by the page" in err
     names = {kind: [one["name"] for one in found] for kind, found in json.loads(out).items()}

@@ -421,12 +421,16 @@ def test_a_port_belongs_to_one(first: str, second: str, lines: Callable[..., Lin
     choose(wanted, CONFIG.rates).open().close()
 
 
-@pytest.mark.parametrize("name", ["absent", "folder", "file", "long" * 30])
-@pytest.mark.parametrize("configured", [{}, {"backend": "can", "options": {"interface": "tormagsim"}}])
-def test_what_is_no_port_and_no_channel_is_not_opened(configured: dict[str, Any], name: str, tmp_path: Path) -> None:
+@pytest.mark.parametrize("name", ["absent", "folder", "file", "pipe", "long" * 30])
+@pytest.mark.parametrize("interface", ["", "tormagsim", "slcan"])
+def test_what_is_no_port_and_no_channel_is_not_opened(interface: str, name: str, tmp_path: Path) -> None:
+    configured = {"backend": "can", "options": {"interface": interface}} if interface else {}
     path = tmp_path / name
     (tmp_path / "folder").mkdir()
+    os.mkfifo(tmp_path / "pipe")
     (tmp_path / "file").write_text("")
     with pytest.raises(BackendError, match="cannot be opened") as caught:
         choose(Device(**configured, port=str(path)), CONFIG.rates).open()
     assert (str(caught.value).count(str(path)), "Success" in str(caught.value)) == (1, False)
+    is_told = name in ("file", "pipe") and interface != "tormagsim"
+    assert str(caught.value).endswith("allowed is a serial port; this is none") is is_told

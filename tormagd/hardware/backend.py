@@ -23,6 +23,7 @@ PLUGIN_ERRORS = (
     ImportError, AttributeError, NameError, TypeError, ValueError, LookupError, OSError, RuntimeError, SyntaxError,
 )  # fmt: skip
 "A foreign plugin's module may raise any of these while it is imported."
+NO_PORT = "allowed is a serial port; this is none", "tormagctl ports lists them: name one in device.port"
 
 log = logging.getLogger(__name__)
 

@@ -21,7 +21,7 @@ from msgspec import Meta
 from firmware_protocol.codec import Message
 from tormagd.config import Device, Rates
 from tormagd.ground.files import did_you_mean
-from tormagd.hardware.backend import PLUGIN_ERRORS, BackendError, Driver
+from tormagd.hardware.backend import NO_PORT, PLUGIN_ERRORS, BackendError, Driver
 from tormagd.hardware.streams import CanStream, SecondHostError
 from tormagd_client.endpoints import ConfigError, Strict
 
@@ -196,6 +196,8 @@ def open_can(device: Device, options: CanOptions) -> CanBackend:
             raise BackendError(f"{name}: another program holds it", remedy="tormagctl ports says which") from error
         number = _errno(error)
         reason, remedy = os.strerror(number) if number else str(error), ""
+        if os.strerror(errno.ENOTTY) in str(error):
+            reason, remedy = NO_PORT
         if options.interface == "socketcan" and number in ABSENT:
             reason, first = ABSENT[number]
             remedy = f"{first}, then {_bring_up(device.port, options)}"

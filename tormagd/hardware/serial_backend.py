@@ -15,7 +15,7 @@ import serial
 from msgspec import Meta
 
 from tormagd.config import Device
-from tormagd.hardware.backend import BackendError, Driver
+from tormagd.hardware.backend import NO_PORT, BackendError, Driver
 from tormagd.hardware.serial_port import SerialPort
 from tormagd_client.endpoints import Strict
 
@@ -58,6 +58,7 @@ _REFUSALS = {
     errno.EAGAIN: _HELD,  # from flock
     errno.EBUSY: _HELD,
     errno.ENOENT: ("there is no such port", "plug the device in and switch it on; it is tried again"),
+    errno.ENOTTY: NO_PORT,
     errno.EACCES: ("no permission", "join the group that owns it (dialout or tormag; ls -l shows it), log in again"),
 }
 
@@ -76,8 +77,8 @@ def open_serial(device: Device, options: SerialOptions) -> SerialPort:
         port.reset_input_buffer()
         make_prompt(port)
     except OSError as error:  # SerialException is one too; its text repeats path and number
-        reason = os.strerror(error.errno) if error.errno else str(error)
-        reason, remedy = _REFUSALS.get(error.errno or 0, (reason, ""))
+        number = errno.ENOTTY if os.strerror(errno.ENOTTY) in str(error) else error.errno or 0
+        reason, remedy = _REFUSALS.get(number, (os.strerror(number) if number else str(error), ""))
         raise BackendError(f"{device.port}: cannot be opened: {reason}", remedy) from error
     except (termios.error, ValueError) as error:  # unplugged during set-up, or a rate that the driver lacks
         raise BackendError(f"{device.port}: cannot be opened: {error.args[-1]}") from error
