@@ -109,7 +109,7 @@ def test_where_the_force_falls_branches_are_compared() -> None:
         ({"depth_mm = 2.0": "depth_mm = 2.0\nmost_mm_s = 9.0"}, "finger.most_mm_s = 9: allowed is -4..4"),
         ({"[finger]": "[handle]\nmost_mm_s = 50.0\n[finger]"}, "allowed is none where element is tactile; [finger]"),
         ({'model = "t': 'thickness_mm = 12.0\nmodel = "t'}, "insert.thickness_mm = 12.0: allowed is none where"),
-        ({"tactile_mre_c": "torque_mre_50_40"}, "trained on the torque element, but the tactile element is in use"),
+        ({"tactile_mre_c": "torque_mre_50_40"}, "element = 'tactile': allowed is torque, on which"),
         ({"most_N = 3.9": "most_N = 6.0"}, "force.most_N = 6: allowed is"),
     ],
 )

@@ -105,6 +105,12 @@ MISTAKES: list[tuple[str, int, str | tuple[str, ...], dict[str, str]]] = [
     ("tormagctl calibrate --motors --out there", 2, "--out there: allowed is a new file", {"there": "precious"}),
     ("tormagctl calibrate --insert A --out none/m.csv", 2, "--out none/m.csv: allowed is a new file in a folder", {}),
     ("tormagctl calibrate --insert A --out m.csv", 2, "--yes", {}),
+    (
+        "tormagctl scene check mine.toml",
+        1,
+        "insert.name = 'MRE-9' is not allowed: with insert.model = 'auto' one of MRE-10-10, ",
+        {"mine.toml": SCENE.replace("cut.safetensors", "auto").replace("MRE-50-40", "MRE-9")},
+    ),
     ("tormagctl record nowhere", 2, "nowhere: No such file or directory", {}),
     ("tormagctl record /dev/full", 2, "/dev/full: Not a directory", {}),
     ("tormagctl recordings list /dev/full", 2, "/dev/full: Not a directory", {}),

@@ -346,8 +346,7 @@ def test_out_of_reach_is_the_end_and_says_so(units: Steps, beyond: float, last: 
 
 @pytest.mark.parametrize("end", RANGE_MT)
 def test_out_of_reach_costs_one_evaluation_while_it_lasts(rising: ForceModel, end: float) -> None:
-    force = 100.0 if end == RANGE_MT[1] else -100.0
-    assert solved(rising.curve(0.5, 10.0, CIP), force, end).iterations == 1
+    assert solved(rising.curve(0.5, 10.0, CIP), (100.0 if end == RANGE_MT[1] else -100.0), end).iterations == 1
 
 
 def test_from_the_answer_it_does_not_move(rising: ForceModel) -> None:

@@ -231,8 +231,8 @@ def test_weights_that_are_not_finite_are_refused(saved: Path, value: float) -> N
 
 
 def test_a_model_for_something_else_is_refused(saved: Path) -> None:
-    refused(saved, "trained on insert MRE-50-40, but MRE-10-30 is in use", insert="MRE-10-30")
-    refused(model_path("tactile_mre_c", Path()), "trained on the tactile element, but the torque element is in use")
+    refused(saved, "insert.name = 'MRE-10-30': allowed is MRE-50-40, on which", insert="MRE-10-30")
+    refused(model_path("tactile_mre_c", Path()), "element = 'torque': allowed is tactile, on which")
 
 
 def test_what_is_no_model_file_is_refused(tmp_path: Path, model: ForceModel) -> None:
@@ -333,7 +333,7 @@ def test_a_model_of_several_inserts_is_loaded_in_the_box_of_the_one_that_is_aske
         < 0.9
         < of_two.curve(0.3, 12.0, 20.0).confidence(700.0, 0.0)
     )
-    refused(path, "trained on insert MRE-50, but MRE-50-30 is in use", insert="MRE-50-30")
+    refused(path, "insert.name = 'MRE-50-30': allowed is MRE-50, on which", insert="MRE-50-30")
 
 
 def test_a_box_that_is_none_is_refused(of_two: ForceModel) -> None:
@@ -396,8 +396,9 @@ def test_a_grid_of_fields_has_the_forces_of_its_fields(
     fields = np.linspace(250.0, 850.0, 61)
     forces = curve.forces_N(fields.astype(dtype))
     assert forces.dtype == dtype
-    one_by_one = [curve.force_N(field) for field in fields.tolist()]
-    assert forces == pytest.approx(one_by_one, rel=0, abs=accuracy * curve.magnitude_N)
+    assert forces == pytest.approx(
+        [curve.force_N(field) for field in fields.tolist()], rel=0, abs=accuracy * curve.magnitude_N
+    )
 
 
 @pytest.mark.parametrize("exponent", [LARGEST_EXPONENT, 709.7, 710.0, 1e4, 1e18])

@@ -35,6 +35,7 @@ from tormagd.element.model.features import (
 from tormagd.element.model.force_curve import ForceCurve, Known, Network
 from tormagd.element.model.memory import NO_MEMORY, Memory
 from tormagd.element.physics.errors import DomainError, require_that
+from tormagd.element.physics.inserts import INSERTS
 from tormagd.ground.files import in_place_of, named, read_bounded, shipped
 
 Array: TypeAlias = NDArray[np.float64]
@@ -135,8 +136,7 @@ class ForceModel:
             object.__setattr__(self, name, _weights(name, getattr(self, name), shape))
         require_number("output_bias", self.output_bias)
         object.__setattr__(self, "physical", self._fold())
-        known = Known(self.feature_ranges, self.force_span_N)
-        object.__setattr__(self, "network", Network(*self.physical, known))
+        object.__setattr__(self, "network", Network(*self.physical, Known(self.feature_ranges, self.force_span_N)))
 
     def _fold(self) -> PhysicalLayers:
         scaling = self.metadata.scaling
@@ -228,9 +228,9 @@ def load_model(path: Path | str, *, element: Element | str, insert: str | None =
         raise ModelFileError(f"{source}: {error}") from error
     found = model.metadata
     if found.element != element:
-        raise ModelFileError(f"{source}: trained on the {found.element} element, but the {element} element is in use")
+        raise ModelFileError(f"element = {str(element)!r}: allowed is {found.element}, on which {source} was trained")
     if insert is not None and found.insert != insert:
-        raise ModelFileError(f"{source}: trained on insert {found.insert}, but {insert} is in use")
+        raise ModelFileError(f"insert.name = {insert!r}: allowed is {found.insert}, on which {source} was trained")
     return model
 
 
@@ -336,4 +336,6 @@ def model_path(name_or_path: str, beside: Path, insert: str = "") -> Path:
     if name_or_path == AUTO:
         own = f"torque_{insert.lower().replace('-', '_')}"
         name_or_path = own if own in shipped(_FOLDER, _ENDING) else own.rpartition("_")[0]
+        allowed = f"with insert.model = 'auto' one of {', '.join(INSERTS)}"
+        require_that(name_or_path in shipped(_FOLDER, _ENDING), "insert.name", repr(insert), allowed)
     return named("insert.model", name_or_path, _FOLDER, _ENDING, beside)
