@@ -54,8 +54,7 @@ def _markdown_row(signal: SignalSource) -> str:
 def generated_files(room: Path) -> dict[Path, str]:
     """Return the text that each generated file of a folder should have, by its path."""
     schema = read_schema(room / DBC.name)
-    readme = (room / "README.md").read_text(encoding="utf-8")
-    before, rest = readme.split(TABLE_BEGIN)
+    before, rest = (room / "README.md").read_text(encoding="utf-8").split(TABLE_BEGIN)
     after = rest.split(TABLE_END)[1]
     files = {room / name: text for name, text in python_files(schema).items()}
     files |= {room / "README.md": before + markdown_tables(schema) + after}

@@ -90,8 +90,10 @@ def is_passed(boot: FirmwareKind) -> bool:
     port = VirtualPort(VirtualDevice(load_plant("sample_1"), SteadyHand(), boot=boot))
     line, messages = SerialLine(port), port.device.messages
     host = Host(line, reset=lambda how: messages._reset(port.now_s()))
-    results = list(run(host, CHECKS))
-    print(*(f"{result.check.name}: {result.seen}" for result in results), sep="\n", flush=True)
+    results = []
+    for result in run(host, CHECKS):
+        results.append(result)
+        print(f"{result.check.name}: {result.seen}", flush=True)
     failed = [result.check.name for result in results if result.passed is False]
     print(f"{len(results)} checks, {len(failed)} failed: {', '.join(failed) or 'none'}")
     return not failed

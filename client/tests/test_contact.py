@@ -25,8 +25,7 @@ class Tip:
 
     def _go(self, to_mm: float) -> None:
         """Move at the tip's speed, or rest for a second if it is there."""
-        step_mm = self.speed_mm_s / HZ
-        steps = round(abs(to_mm - self.place_mm) / step_mm)
+        steps = round(abs(to_mm - self.place_mm) * HZ / self.speed_mm_s)
         onward_mm = (to_mm - self.place_mm) / steps if steps else 0.0
         for _ in range(steps or HZ):
             self.place_mm += onward_mm

@@ -66,7 +66,7 @@ V1: dict[type[msgspec.Struct], str] = {
     "unanswered_share damaged_share",
     RoundTripReport: "least p50 p99",
     ClockReport: "offset_s drift_ppm residual_us windows outliers",
-    SetpointReport: "accepted refused dropped oversize last_refusal newest_source sources by_source playout",
+    SetpointReport: "accepted refused dropped last_refusal newest_source sources by_source playout",
     SourceReport: "state silent_ms session seq accepted refused lost restarts delay_us jitter_us clock_behind_ms "
     "clock_steps clock cause remedy",
     WayReport: "to_duty_us device_us carriages_ms total_ms budget_ms",

@@ -55,8 +55,7 @@ class Target(Enum):
 
     def __init__(self, sources: tuple[str, ...], flags: tuple[str, ...], needs: str | None = None) -> None:
         self.sources = tuple(ROOM / f"{name}.c" for name in (*FIRMWARE, *sources))
-        self.flags = flags
-        self.needs = needs
+        self.flags, self.needs = flags, needs
 
 
 def compiler() -> str:

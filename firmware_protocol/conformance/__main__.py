@@ -43,7 +43,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Examine the device on a line, once the user has agreed that its motors move, and print the results."""
     command = parser()
     options = command.parse_args(arguments)
-    _require_bounds(command, options)
+    for name, (least, most) in BOUNDS.items():
+        if not least <= getattr(options, name) <= most:
+            command.error(f"{name} = {getattr(options, name):g}: allowed is {least:g}..{most:g}")
     if not (options.yes or _is_agreed(options.line)):
         command.exit(USAGE, f"{command.prog}: nothing was sent; say yes, or --yes where nobody can be asked\n")
     try:
@@ -53,12 +55,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
     with contextlib.closing(line.port):
         checks = [one for one in CHECKS if not options.only or one.name in options.only or one is left_open]
         return PASSED if _examined(line, checks, options) else FAILED
-
-
-def _require_bounds(command: argparse.ArgumentParser, options: argparse.Namespace) -> None:
-    for name, (least, most) in BOUNDS.items():
-        if not least <= getattr(options, name) <= most:
-            command.error(f"{name} = {getattr(options, name):g}: allowed is {least:g}..{most:g}")
 
 
 def report(results: Sequence[Result]) -> dict[str, Any]:
@@ -129,8 +125,8 @@ def _performed(host: Host, checks: Sequence[Check], out: TextIO | None) -> tuple
     except OSError as error:
         ended = f"the line is gone ({error})"
         _say(f"{ended}: by the page the device opens the gap by itself now", sys.stderr)
-    tried = [result.check for result in results]
-    return results + [Result(one, passed=None, seen=ended) for one in checks if one not in tried], ended
+    untried = set(checks).difference(result.check for result in results)
+    return results + [Result(one, passed=None, seen=ended) for one in checks if one in untried], ended
 
 
 def _summary(host: Host, results: Sequence[Result]) -> str:

@@ -53,11 +53,8 @@ def run(host: Host, checks: Iterable[Check]) -> Iterator[Result]:
     """Perform checks in order, and yield the result of each."""
     closed_by = ""
     for one in checks:
-        result = (
-            Result(one, passed=False, seen=f"not tried, because {closed_by} failed")
-            if one.moves and closed_by
-            else _performed(host, one)
-        )
+        seen = f"not tried, because {closed_by} failed"
+        result = Result(one, passed=False, seen=seen) if one.moves and closed_by else _performed(host, one)
         closed_by = closed_by or (one.name if one.is_gate and result.passed is False else "")
         yield result
 

@@ -101,11 +101,8 @@ class Host:
         reset: Callable[[str], None] | None = None,
         ask: Callable[[str], object] = lambda what: None,
     ) -> None:
-        self.line = line
-        self.opening_mm_s = opening_mm_s
-        self.stroke_mm = stroke_mm
-        self.reset = reset
-        self.ask = ask
+        self.line, self.reset, self.ask = line, reset, ask
+        self.opening_mm_s, self.stroke_mm = opening_mm_s, stroke_mm
         self.random = random.Random(41)
         self.heard: list[Heard] = []
         self.newest: dict[type[object], Heard] = {}
@@ -124,10 +121,9 @@ class Host:
         self._answers_s = deque[float](maxlen=LATE_DRIVES)
         """When the newest States came."""
         self._opens = 0
-        self.drives = self.states = self.senses = 0
+        self.drives = self.states = self.senses = self.counter = 0
         """How many Drives that must be answered were sent, and how many State came."""
         self.drive_s = self._next_s = line.port.now_s()
-        self.counter = 0
         self.said = Drive(0.0, 0.0, DriveMode.OFF, 0)
         self.stalled_s = self.late_s = 0.0
         """This process's greatest lateness since `begin`, and at all."""
@@ -231,11 +227,9 @@ class Host:
     def begin(self) -> None:
         """Let answers arrive, forget what was heard and the lateness, and restart the rhythm."""
         self.pass_time(ANSWER_S)
-        self.heard.clear()
-        self.stalled_s = 0.0
-        self._asked.clear()
-        self._unpaired.clear()
-        self._next_s = self.now_s
+        for known in (self.heard, self._asked, self._unpaired):
+            known.clear()
+        self.stalled_s, self._next_s = 0.0, self.now_s
 
     def all_of(self, kind: type[M]) -> list[tuple[float, M]]:
         return [(heard.time_s, heard.message) for heard in self.heard if isinstance(heard.message, kind)]

@@ -52,8 +52,7 @@ class SerialLine:
     def __init__(self, port: Port) -> None:
         self.port = port
         self._decoder = FrameDecoder()
-        self._sequence = 0
-        self._has_begun = False
+        self._sequence, self._has_begun = 0, False
         port.write(DELIMITER)  # ends whatever was there before
 
     def send(self, function: int, payload: bytes) -> None:
@@ -61,8 +60,7 @@ class SerialLine:
 
     def damages(self, function: int, payload: bytes) -> Mapping[str, tuple[bytes, ...]]:
         """Return damaged forms of a frame, by the kind of damage, which a device has to ignore."""
-        frame = self._frame(function, payload)
-        body = frame[:-1]
+        body = self._frame(function, payload)[:-1]
         whole = cobs_decode(body) or b""
         last = whole.rfind(DELIMITER) + 1
         damaged = {

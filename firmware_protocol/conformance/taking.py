@@ -145,10 +145,8 @@ def refused(host: Host, ahead: int = 1) -> Iterator[Sent]:
         for name, change in REFUSED_COMMANDS.items():
             if change or kind is not Hello:
                 body = _command(kind, host.new_nonce() if change else host.status.command_nonce)
-                yield Sent(
-                    f"{kind.__name__} with {name}",
-                    partial(host.line.send, FUNCTION[kind], change(body) if change else body),
-                )
+                sent = change(body) if change else body
+                yield Sent(f"{kind.__name__} with {name}", partial(host.line.send, FUNCTION[kind], sent))
 
 
 def damaged(host: Host) -> Iterator[Sent]:

@@ -358,12 +358,8 @@ def positions_run_on(host: Host) -> str:
         off, least = off_way(rows, f"{side}_mm"), least_step(rows, f"{side}_mm", STEP_MM)
         if least == UNMOVED:
             raise Untested("nothing moved; run all checks")
-        seen.append(
-            unless(
-                off.max() > STEPS * STEP_MM or least > 1,
-                f"{side}: {off.max() * 1e3:.1f} um off the way, in steps of {least}",
-            )
-        )
+        is_wrong = off.max() > STEPS * STEP_MM or least > 1
+        seen.append(unless(is_wrong, f"{side}: {off.max() * 1e3:.1f} um off the way, in steps of {least}"))
     return "; ".join(seen)
 
 

@@ -135,8 +135,7 @@ class Together(RuleBasedStateMachine):
         self.line = BadLine(device)
         self.loop.port.device = self.line
         self.struck: set[str] = set()
-        self.force_N = 1.1
-        self.is_armed = False
+        self.force_N, self.is_armed = 1.1, False
         self.firmware, self.mode = device.messages.firmware, DeviceMode.IDLE
         # in periods: when the daemon last drove, asked for each request, and reset the device
         self.undriven = self.reset = self.hangs_until = 0

@@ -33,8 +33,7 @@ def test_both_builds_give_the_same_results_to_the_bit() -> None:
     build, _ = judged(ROOT, None)
     if not build.is_compiled:
         pytest.skip(f"there is one build only, {build}")
-    processes = [started("1"), started("0")]
-    compiled, interpreted = map(told, processes)
+    compiled, interpreted = map(told, [started("1"), started("0")])
     assert (compiled["is_compiled"], interpreted["is_compiled"]) == (True, False)
     assert compiled["digest"] == interpreted["digest"]
 

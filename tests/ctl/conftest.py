@@ -190,8 +190,7 @@ class FakeDaemon(threading.Thread):
             "status": lambda: {"ok": True, "result": status(setpoints=self.taken())},
             "describe": lambda: {"ok": True, "result": DESCRIPTION},
         }
-        self.taken_share = 1.0
-        self.is_silent = False
+        self.taken_share, self.is_silent = 1.0, False
         self.commands: list[str] = []
         self.requests: list[dict[str, Any]] = []
         self.setpoints: list[Setpoint] = []

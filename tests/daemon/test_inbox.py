@@ -25,8 +25,7 @@ START_NS = 1_800_000_000_000_000_000
 class Publishing:
     def __init__(self, sources: Sources = Sources()) -> None:  # noqa: B008 it is immutable
         self.inbox = SetpointInbox(sources)
-        self.now_s = 0.0
-        self.step_s = 0.0
+        self.now_s = self.step_s = 0.0
 
     @property
     def realtime_ns(self) -> int:

@@ -180,8 +180,7 @@ class Rogue:
         time_s += self.up_s
         self.before(time_s, message)
         if isinstance(message, Drive):
-            self.asked = message
-            self.drive_s = time_s
+            self.asked, self.drive_s = message, time_s
         heard = self.hears(message)
         answer = Answer.NONE if heard is None else self.real.receive(time_s, heard, self.senses(sensors))
         self.after(time_s, message)

@@ -159,6 +159,13 @@ def test_a_recorder_whose_budget_is_full_ends_its_segment_in_order(tmp_path: Pat
     assert known.damage == ""
 
 
+def test_a_recording_that_was_taken_away_is_none(tmp_path: Path) -> None:
+    recorder = RecordingWriter(tmp_path / "a.mcap")
+    recorder.path.unlink()
+    with pytest.raises(FileNotFoundError):
+        recorder.close()
+
+
 def test_a_segment_is_ended_in_order_whatever_keeps_the_next_from_beginning(tmp_path: Path, monkeypatch) -> None:
     recorder = RecordingWriter(RecordingFolder(tmp_path, SETTINGS, Clock()))
     monkeypatch.setattr(RecordingFolder, "new", Mock(side_effect=PermissionError(13, "Permission denied")))

@@ -5,8 +5,7 @@ from typing import Any
 
 class VirtualPort:
     def __init__(self, device: Any) -> None:
-        self.device = device
-        self.time_s = 0.0
+        self.device, self.time_s = device, 0.0
 
     def now_s(self) -> float:
         return self.time_s

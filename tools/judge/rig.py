@@ -49,8 +49,7 @@ class Rig:
         port = VirtualBus(self.line) if isinstance(self.line, BadBus) else self.line
         self.loop = ClosedLoop(self.config, core.stepper(), core.planner(), port)
         self.publisher = Publisher() if injection.publisher is None else DaemonsBorder()
-        self.is_dead = False
-        self._stalled_ms = 0
+        self.is_dead, self._stalled_ms = False, 0
         self._hogged_ms: int | None = None
 
     @property

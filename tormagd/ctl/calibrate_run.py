@@ -124,9 +124,8 @@ class Run(Device):
         due_s = time.monotonic() + 1.0 / RATE_HZ
         if asked.force_N is not None:
             ahead_N = asked.preview_N or None
-            self._client.publish(
-                asked.force_N, VALID_FOR_MS, preview_N=ahead_N, preview_dt_ms=1e3 * PREVIEW_STEP_S if ahead_N else None
-            )
+            step_ms = 1e3 * PREVIEW_STEP_S if ahead_N else None
+            self._client.publish(asked.force_N, VALID_FOR_MS, preview_N=ahead_N, preview_dt_ms=step_ms)
         self.progress.show()
         rows: list[Row] = []
         # whatever waits is read even if this program is late

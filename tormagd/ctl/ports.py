@@ -82,9 +82,8 @@ def _serial_port(machine: Machine, path: str, info: Any, opened: Sequence[tuple[
 
 
 def _is_line(config: Config) -> bool:
-    return config.device.port.startswith("/") and (
-        config.device.backend != "can" or config.device.options.get("interface") == "slcan"
-    )
+    is_adapter = config.device.options.get("interface") == "slcan"
+    return config.device.port.startswith("/") and (config.device.backend != "can" or is_adapter)
 
 
 def _is_up(machine: Machine, channel: str) -> bool | None:

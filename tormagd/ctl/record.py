@@ -239,6 +239,8 @@ def _export(path: Path, target: Path | None) -> Outcome:
     if target is None:
         raise usage_error("export: no place is named", f"tormagctl recordings export {path} --to FOLDER")
     copy = target / path.name if target.is_dir() else target
+    if not copy.suffix:
+        raise usage_error(f"{target}: no such folder", f"mkdir -p {target}, or name a file: COPY.mcap")
     require_regular(path)
     with new_file(copy):
         shutil.copyfile(path, copy)

@@ -37,9 +37,8 @@ def list_scenes() -> Outcome:
 
 def show_scene(config: Config, name: str | None) -> Outcome:
     """Return everything a scene states, defaults included, as TOML."""
-    tables = {
-        key: value for key, value in msgspec.to_builtins(loaded(name or config.scene)).items() if value is not None
-    }
+    stated = msgspec.to_builtins(loaded(name or config.scene))
+    tables = {key: value for key, value in stated.items() if value is not None}
     return Outcome(tables, as_toml(tables))
 
 

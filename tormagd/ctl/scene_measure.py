@@ -219,7 +219,8 @@ def errors_N(course: Course, heard: Heard, gap_open_mm: float, standby_N: float)
         if name == "steps":
             phase_s = (time_s - begins_s) % STEP_S
             inside &= (phase_s >= COMES_S) & (phase_s < STEP_S - 2.0 / DENSE_HZ)  # the next is not yet asked for
-        error_N = (truth["force_N"] - np.maximum(np.interp(time_s, course.time_s, course.force_N), standby_N))[inside]
+        asked_N = np.interp(time_s, course.time_s, course.force_N)
+        error_N = (truth["force_N"] - np.maximum(asked_N, standby_N))[inside]
         is_least = (truth["gap_mm"][inside] >= gap_open_mm - OPEN_MM) & (error_N > 0.0)
         found[name] = round(float(np.sqrt(np.mean(np.where(is_least, 0.0, error_N) ** 2))), 5)
     return found

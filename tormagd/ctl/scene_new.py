@@ -154,16 +154,8 @@ def _from_recording(out: Path, force_file: Path) -> Tables:
         )
     tolerance_N = _rounded(max(TOLERATED * (most_N - least_N), TOLERATED_OF_MOST * most_N), math.ceil)
     said = f"What {force_file.name} asks for in {time_s[-1]:.0f} s: {least_N:g} to {most_N:g} N."
-    return _tables(
-        out.stem,
-        said,
-        least_N,
-        most_N,
-        2.0 * tolerance_N,
-        tolerance_N,
-        {"file": os.path.relpath(force_file, out.parent)},
-        (42.0, 42.0),
-    )
+    signal = {"file": os.path.relpath(force_file, out.parent)}
+    return _tables(out.stem, said, least_N, most_N, 2.0 * tolerance_N, tolerance_N, signal, (42.0, 42.0))
 
 
 def _from_answers(name: str) -> Tables:

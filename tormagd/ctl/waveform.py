@@ -97,6 +97,5 @@ def read_csv(path: Path, stated: Mapping[str, str] | None = None) -> Waveform:
     values = table.values
     start_s = values["time_s"][0]
     times_s = array("d", (time_s - start_s for time_s in values["time_s"]))
-    return _lines(times_s, values["force_N"], *(values.get(name) for name in OPTIONAL_COLUMNS))._replace(
-        told=tuple(table.told)
-    )
+    others = (values.get(name) for name in OPTIONAL_COLUMNS)
+    return _lines(times_s, values["force_N"], *others)._replace(told=tuple(table.told))

@@ -189,7 +189,7 @@ class Daemon:
         try:
             # those that wait for a plan are cheaper together
             has_come = (is_every or self._inference.is_due(beat)) and self._endpoint.take_setpoints()
-        finally:  # the setpoint in force ages, whatever is wrong with the next
+        finally:  # or nothing would age
             self._inference.plan(
                 beat, stepper.measured, is_asked=is_every and has_come, is_followed=stepper.is_followed
             )

@@ -83,8 +83,7 @@ class RateGroup:
         self.stalls = 0
         self.delay_ns = 0
         "From when the newest run, with the missed ones before it, was due until it ended."
-        self.lateness_us = 0.0
-        self.exec_us = 0.0
+        self.lateness_us = self.exec_us = 0.0
         self.lateness = Histogram()
         self.exec = Histogram()
         self._worst_us = 0.0

@@ -23,8 +23,7 @@ class Service:
     def __init__(self) -> None:
         self.is_ready = False
         "Whether a device has been identified; from then on systemd's watchdog runs."
-        self._heard_s = 0.0
-        self._status = ""
+        self._heard_s, self._status = 0.0, ""
 
     def tell(
         self, now_s: float, limit_s: float, control: ControlLoop, plan: Plan, connection: Connection, scene: str

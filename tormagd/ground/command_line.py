@@ -2,8 +2,10 @@
 
 import argparse
 import math
+import os
 import sys
 from collections.abc import Iterable
+from pathlib import Path
 from typing import Any, NamedTuple, NoReturn, TypeAlias
 
 from tormagd.ground.files import did_you_mean
@@ -12,6 +14,7 @@ from tormagd_client.printable import in_short, printable
 
 LONGEST = 300
 "Characters of a refusal that quotes what was given."
+MAX_NAME_BYTES = 255
 UNKNOWN_OPTION = "unrecognized arguments: "
 Option: TypeAlias = tuple[tuple[str, ...], dict[str, Any]]
 
@@ -38,6 +41,10 @@ class Parser(argparse.ArgumentParser):
 
     options: tuple[str, ...] = ()
 
+    def __init__(self, *given: Any, **settings: Any) -> None:
+        super().__init__(*given, **settings)
+        self.register("type", Path, path)
+
     def error(self, message: str) -> NoReturn:
         """Raise UsageError with this message, cut to LONGEST characters."""
         if message.startswith(UNKNOWN_OPTION):
@@ -53,6 +60,13 @@ class Parser(argparse.ArgumentParser):
     def _print_message(self, message: str, file: Any = None) -> None:
         if not write_answer(message.rstrip(), self.prog):
             sys.exit(1)
+
+
+def path(text: str) -> Path:
+    """Parse a path that a file system may have."""
+    if not text or any(len(os.fsencode(part)) > MAX_NAME_BYTES for part in text.split("/")):
+        raise argparse.ArgumentTypeError(f"{in_short(text)}: allowed are names of 1..{MAX_NAME_BYTES} bytes")
+    return Path(text)
 
 
 def number(text: str) -> float:

@@ -58,8 +58,7 @@ class Connection:
         self._requested = 0
         self._unfinished = DeviceRequest.NONE
         self._seen = LinkState.CLOSED
-        self.losses = 0
-        self._last_loss = ""
+        self.losses, self._last_loss = 0, ""
         self.traffic: Callable[..., None] = lambda *what: None
         "Hears what passes between daemon and device: the black box's journal."
 

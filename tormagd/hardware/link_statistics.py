@@ -211,8 +211,7 @@ class DeviceClock:
         self._least: tuple[float, float] = (math.inf, 0.0)
         self._ends_s = -math.inf
         self._newest_s = -math.inf
-        self._standing = 0
-        self.drift = 0.0
+        self._standing, self.drift = 0, 0.0
         "The share by which the clock runs fast; 0 while unknown, -1 for a clock that stands."
 
     def add(self, host_s: float, device_s: float) -> None:

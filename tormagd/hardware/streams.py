@@ -104,9 +104,7 @@ class FrameStream:
 
     def __init__(self) -> None:
         self._decoder = FrameDecoder()
-        self._sequence = 0
-        self.received = b""
-        self.sent = b""
+        self._sequence, self.received, self.sent = 0, b"", b""
 
     @property
     def statistics(self) -> FramingStatistics:

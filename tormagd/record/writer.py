@@ -275,6 +275,8 @@ class RecordingWriter:
                 self.__exit__(type(error), error, None)
                 raise
             self._end()
+            if self._folder is None:  # in a folder, `mark` renames it
+                self.path.stat()
 
     def _end(self) -> None:
         with self._file:

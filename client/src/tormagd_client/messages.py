@@ -288,7 +288,6 @@ class SetpointReport(msgspec.Struct, frozen=True, kw_only=True):
     accepted: int
     refused: int
     dropped: int
-    oversize: int = 0
     last_refusal: str | None
     newest_source: str
     sources: dict[str, int]
@@ -565,7 +564,7 @@ def decode(data: bytes, message_type: type[M]) -> M:
 
 
 def _require_whole(data: bytes) -> None:
-    """Look whether all that lengths announce is there: msgpack takes memory for it before it looks."""
+    """Require all that lengths announce: msgpack takes memory for it first."""
     try:
         _RAW.decode(data)
     except (msgspec.DecodeError, RecursionError) as error:

@@ -170,8 +170,7 @@ def armed(report: ArmReport) -> tuple[str, ...]:
 
 
 def refused(command: str, code: str, message: str, hint: str) -> RefusedError:
-    kind = InFaultError if code in FAULT_CODES else RefusedError
-    return kind(command, code, message, hint)
+    return (InFaultError if code in FAULT_CODES else RefusedError)(command, code, message, hint)
 
 
 def _contact(fields: Mapping[str, float]) -> Contact:

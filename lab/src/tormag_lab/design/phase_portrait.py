@@ -83,8 +83,7 @@ class PhasePortrait:
         force = np.clip(brake.force_N(gap_mm), low, high)
         rendered = np.minimum(region.rate_N_s(force), self.gap_speed_mm_s * slope)
         # summed over the force's differences, full coverage is exactly 1
-        area = -float(np.trapezoid(rendered, force))
-        return min(area / region.half_area, 1.0)
+        return min(-float(np.trapezoid(rendered, force)) / region.half_area, 1.0)
 
     def trapezoid_coverage(self, region: Region) -> float:
         offered = self.trapezoid()

@@ -105,8 +105,7 @@ class Taking:
     """Makes an `Excerpt` of control ticks, taken in the order of time."""
 
     def __init__(self, name: str) -> None:
-        self._name = name
-        self._refusal = ""
+        self._name, self._refusal = name, ""
         self._rows: list[tuple[float, ...]] = []
         self._first_s = math.nan
         self._reading_N = math.nan

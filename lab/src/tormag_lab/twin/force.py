@@ -73,8 +73,7 @@ def fresh_along(plant: PlantParameters, way: Excerpt) -> Array:
 
 def along(plant: PlantParameters, way: Excerpt, memory_N: Sequence[float], fresh: Array) -> Array:
     """Return the friction (n), signed as the handle's motion, as the sensor shows it after its delay."""
-    series = plant.relaxation.law
-    step = series.discretise(1.0 / GRID_HZ)
+    step = plant.relaxation.law.discretise(1.0 / GRID_HZ)
     changes = np.diff(fresh, prepend=fresh[0])
     kinetic = step.equilibrium_fraction * fresh
     for share, decay, gain, left_N in zip(step.fractions, step.decays, step.gains, memory_N, strict=True):
