@@ -525,8 +525,9 @@ def waiting(client: str) -> Waiting:
         (["a0", "a1", "a2", "b", "c"], 5, ["a0", "b", "c", "a1", "a2"]),
         ([*(f"a{number}" for number in range(WAITING_PER_CLIENT + 3)), "b"], 64 + 1, ["a0", "b", "a1"]),
         ([chr(0x1000 + number) for number in range(WAITING + 5)], WAITING, ["က"]),
+        ([*(chr(0x1000 + at % 50) for at in range(50 * WAITING_PER_CLIENT)), "b"], 50 * 20 + 1, ["က"]),
     ],
-    ids=["each keeps its order", "none takes another's place", "all together are bounded"],
+    ids=["each keeps its order", "none takes another's place", "all together are bounded", "a place is left for more"],
 )
 def test_every_client_has_its_turn_and_its_places(asked: list[str], kept: int, first: list[str]) -> None:
     requests = Requests()

@@ -127,7 +127,7 @@ FIRST = ("stop", "disable")
 _SIGNS = tuple(name.encode() for name in FIRST)
 WAITING_PER_CLIENT = 64
 WAITING = 1_024
-"Requests that wait at most, of one connection and of all; what is beyond is dropped."
+"Requests that wait, of one connection and of all, in equal shares; more are dropped."
 
 
 class Waiting(NamedTuple):
@@ -152,8 +152,8 @@ class Requests:
 
     def put(self, waiting: Waiting) -> bool:
         """Add a request behind its client's others; the client is the first frame of its envelope."""
-        client = waiting.envelope[0]
-        if self.count >= WAITING or len(self._waiting.get(client, ())) >= WAITING_PER_CLIENT:
+        client, share = waiting.envelope[0], WAITING // (len(self._waiting) + 1)
+        if len(self._waiting.get(client, ())) >= min(WAITING_PER_CLIENT, share) or self.count >= WAITING:
             return False
         self._waiting.setdefault(client, deque()).append(waiting)
         self.count += 1
