@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from pathlib import Path
 
-from tormagd.ctl.outcome import Outcome, as_usage_error
+from tormagd.ctl.outcome import Outcome, as_usage_error, usage_error
 from tormagd.ground.access_keys import load_folder
 from tormagd_client.endpoints import ConfigError
 from tormagd_client.keys import PUBLIC, SERVER, fingerprint, generate, load_public
@@ -11,7 +11,9 @@ from tormagd_client.keys import PUBLIC, SERVER, fingerprint, generate, load_publ
 
 def generate_keys(folder: Path, **clients: Sequence[str]) -> Outcome:
     """Make the daemon's key pair if there is none, and one for each of `clients`."""
-    made = []
+    made, names = [], [name for listed in clients.values() for name in listed]
+    if twice := next((name for name in names if names.count(name) > 1), ""):
+        raise usage_error(f"{twice}: allowed is one folder", f"copy its {PUBLIC} into the other one afterwards")
     with as_usage_error(OSError, ConfigError, hint="tormagctl keys generate --help; the guide has the whole exchange"):
         if not (folder / f"{SERVER}{PUBLIC}").exists() or not any(clients.values()):
             made.append(_made(SERVER, SERVER, folder, folder))

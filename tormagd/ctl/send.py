@@ -156,26 +156,31 @@ def send(
     time_column: str | None,
     rate_hz: float,
     duration_s: float | None,
-    from_N: float,
-    to_N: float,
-    frequency_hz: float,
+    from_N: float | None,
+    to_N: float | None,
+    frequency_hz: float | None,
     source: str,
     valid_for_ms: float,
     preview_ms: float,
     is_blind: bool,
 ) -> Outcome:
     """Publish a shape or a CSV file at `rate_hz`, and report what became of it."""
+    is_file, of_shape = bool(Path(what).suffix), {"--from-N": from_N, "--to-N": to_N, "--frequency": frequency_hz}
+    for name, given in (of_shape if is_file else {"--column": column, "--time-column": time_column}).items():
+        if given is not None:
+            raise usage_error(f"{name}: allowed only with a {'shape' if is_file else 'file'}", "tormagctl send --help")
     with as_usage_error(
         WaveformError,
         TableError,
         hint="correct it and send again; tormagctl send --help shows the choices",
     ):
-        if Path(what).suffix:
+        if is_file:
             waveform = read_csv(Path(what), stated_columns(column, time_column))
             lasts_s = min(waveform.duration_s, duration_s or math.inf)
         else:
             lasts_s = duration_s or 10.0
-            waveform = shape(what, from_N, to_N, frequency_hz, lasts_s)
+            lower_N, upper_N = 1.4 if from_N is None else from_N, 1.7 if to_N is None else to_N
+            waveform = shape(what, lower_N, upper_N, frequency_hz or 1.2, lasts_s)
     if valid_for_ms < 1e3 / rate_hz:
         raise usage_error(
             f"--valid-for-ms = {valid_for_ms:g}: allowed is at least one period, {1e3 / rate_hz:g} ms",

@@ -84,9 +84,8 @@ class Sequence:
         self.session, self.seq = session, seq
         self.lost = self.missing = 0
         "Missing messages in all, and just before the newest; only counted if `seq` goes up by ones."
-        self.restarts = 0
+        self.restarts = self._step = 0
         self._latest_session = session
-        self._step = 0
         self._stray_session, self._stray_seq, self._in_row = session, seq, 0
         self._strays, self._strays_since_s = 0, 0.0
 

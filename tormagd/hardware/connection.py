@@ -53,9 +53,7 @@ class Connection:
         self._link: DeviceLink | None = None
         self._waiting = LinkState.CLOSED
         self._cause, self._remedy = "not opened yet", ""
-        self._back_off_s = FIRST_BACK_OFF_S
-        self._reopen_s = 0.0
-        self._requested = 0
+        self._back_off_s, self._reopen_s, self._requested = FIRST_BACK_OFF_S, 0.0, 0
         self._unfinished = DeviceRequest.NONE
         self._seen = LinkState.CLOSED
         self.losses, self._last_loss = 0, ""

@@ -95,17 +95,14 @@ class DeviceLink:
 
     def _begin(self, now_s: float, cause: str) -> None:
         """Begin to identify the device, and forget all that was known of it."""
-        self.state = _IDENTIFYING
-        self.cause = cause
+        self.state, self.cause = _IDENTIFYING, cause
         self.identity: Identity | None = None
         self.round_trip = RoundTrip()
         self.clock = DeviceClock()
         self.quality: LinkQuality = UNKNOWN_QUALITY
         self._quality_watch = LinkWatch(now_s)
         self._heard_s = self._hello_due_s = self._asked_s = now_s
-        self._broken = ""
-        self._delay_s = 0.0
-        self._nonce = 0
+        self._broken, self._delay_s, self._nonce = "", 0.0, 0
         # the device takes a Hello's nonce for the last accepted one, and so acknowledges nothing
         self._acknowledged = FIRST_NONCE
         self._state: State | None = None
@@ -287,9 +284,7 @@ class DeviceLink:
     def _begin_measuring(self, now_s: float, state: State) -> None:
         if self._status is None or self._sense is None:
             return
-        self._is_measured = True
-        self._number = 0
-        self._received_s = now_s
+        self._is_measured, self._number, self._received_s = True, 0, now_s
         self._device_time_s = state.device_time_s
         self._left_mm = state.left_position_mm
         self._right_mm = state.right_position_mm
