@@ -53,14 +53,11 @@ class FramingStatistics(Value):
         repeated: int = 0,
         resynchronisations: int = 0,
     ) -> None:
-        self.bytes = bytes
-        self.frames = frames
-        self.corrupt = corrupt
+        self.bytes, self.frames, self.corrupt = bytes, frames, corrupt
         """Stretches between two delimiters that were not a frame."""
         self.lost = lost
         """Frames missing from the sequence, including corrupt ones, but not overtaken ones."""
-        self.repeated = repeated
-        self.resynchronisations = resynchronisations
+        self.repeated, self.resynchronisations = repeated, resynchronisations
         """Frames found again after something corrupt."""
         self.unsent = 0
         """Sent frames that the port did not take at once."""

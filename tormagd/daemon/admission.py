@@ -77,7 +77,7 @@ REASONS: dict[int, str] = {
     zmq.PROTOCOL_ERROR_ZMTP_MECHANISM_MISMATCH: PLAIN,
     zmq.PROTOCOL_ERROR_ZMTP_CRYPTOGRAPHIC: "another server's key",
 }
-UNASKED_KEY = "no handshake that an open endpoint knows: a key is not to be shown here"
+UNASKED_KEY = "no handshake of an open endpoint: allowed is ZMTP 3 without a key"
 
 log = logging.getLogger(__name__)
 
@@ -126,13 +126,11 @@ class Admission:
         if is_guarded:
             if self._keys is None:
                 raise OSError("CURVE keys are needed: endpoints.curve.server_secret")
-            keyed: dict[int, Any] = {
-                zmq.CURVE_SERVER: 1,
-                zmq.CURVE_SECRETKEY: self._keys.server.secret,
-                zmq.ZAP_DOMAIN: name.encode(),
-            }
+            keyed: dict[int, Any] = {zmq.CURVE_SERVER: 1, zmq.CURVE_SECRETKEY: self._keys.server.secret}
             for option, value in (GUARDED | keyed).items():
                 endpoint.setsockopt(option, value)
+        # where there is a domain, libzmq refuses ZMTP 1.0 and 2.0, of whose peers it tells nothing
+        endpoint.setsockopt(zmq.ZAP_DOMAIN, name.encode())
         known = self._endpoints[name] = _Connections(name, endpoint, is_guarded)
         self._parts.append((known.monitor, partial(self._watch, known)))
         self._arrivals.watch(known.monitor)
@@ -206,12 +204,14 @@ class Admission:
     def _admit(self) -> None:
         """Answer one of libzmq's questions about keys (ZAP, RFC 27), which must wait, and count a refusal."""
         frames = self._zap.recv_multipart(zmq.NOBLOCK)
-        # only libzmq asks here, and only of guarded sockets: the mechanism is CURVE
-        envelope, (version, request, domain, where, _, _, key) = frames[:2], frames[2:]
-        name, address, public = domain.decode(), where.decode(errors="replace"), z85.encode(key).decode()
+        # only libzmq asks here: the mechanism is CURVE, or NULL, of an open socket
+        envelope, (version, request, domain, where, _, mechanism, *keys) = frames[:2], frames[2:]
+        name, address, public = domain.decode(), where.decode(errors="replace"), z85.encode(b"".join(keys)).decode()
         known, listed = self._endpoints[name], self.allowed.get(public)
-        is_admitted = self.has_role(public, MAY[name])
-        (known.admitted if is_admitted else known.refused)[address] += 1
+        is_open = mechanism == b"NULL" and not known.is_guarded
+        is_admitted = is_open or self.has_role(public, MAY[name])
+        if not is_open:
+            (known.admitted if is_admitted else known.refused)[address] += 1
         if not is_admitted:
             reason = "key not listed" if listed is None else f"role not allowed: {', '.join(sorted(listed.roles))}"
             self.refusals.add(name, Peer(address, public), reason)

@@ -50,7 +50,8 @@ OPTIONS: dict[int, dict[int, int]] = {
 }
 """Of each kind of socket: bytes of a message, and messages that wait in libzmq, of one peer and for it."""
 SUBSCRIPTIONS_PER_S, SUBSCRIPTION_BURST = 20.0, 256.0
-"What one subscriber may say. One that says more is cut off, and may connect again."
+LONGEST_WORD = 16
+"What one subscriber may say, in bytes each. One that says more is cut off, and may connect again."
 TAKEN, TAKEN_NS = 64, 80_000
 "Requests taken from the socket in one beat at most, and for how long; subscribers are heard as long at each socket."
 HOPS, LONGEST_ROUTING_ID = 16, 255
@@ -152,7 +153,8 @@ class Endpoint:
                     peer, _ = self._sender(frame, name)
                     if name == "telemetry":
                         self.listeners.hear(frame.bytes, peer if peer.address else None)
-                    if peer.address and not self._subscriptions[name].grants(peer, time.monotonic()):
+                    is_long = len(frame) > LONGEST_WORD
+                    if peer.address and (is_long or not self._subscriptions[name].grants(peer, time.monotonic())):
                         self._drops.add(name, peer, TOO_MUCH)
                         cut.add(peer.address)
             for address in cut:

@@ -131,11 +131,9 @@ class SourceClock:
     def __init__(self) -> None:
         self.offset_s = 0.0
         "The clock's lag behind ours."
-        self.way_s = 0.0
-        self.jitter_s = 0.0
+        self.way_s = self.jitter_s = 0.0
         "RFC 3550's interarrival jitter."
-        self.steps = 0
-        self.stepped_s = 0.0
+        self.steps, self.stepped_s = 0, 0.0
         "Forward positive."
         self.stepped_at_s = -math.inf
         self._lateness_s = self._leaked_s = 0.0
