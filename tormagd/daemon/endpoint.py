@@ -281,7 +281,7 @@ class Endpoint:
 
     def _sender(self, frame: zmq.Frame, name: str) -> tuple[Peer, int]:
         """Return the peer that sent a message, with its key where the endpoint is guarded, and its connection; nobody
-        where it had gone, or speaks ZMTP 1.0."""
+        where it had gone."""
         try:
             connection = int(frame.get(zmq.SRCFD))
             key = str(frame.get("User-Id")) if name in self._guarded else ""
