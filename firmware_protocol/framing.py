@@ -53,11 +53,12 @@ class FramingStatistics(Value):
         repeated: int = 0,
         resynchronisations: int = 0,
     ) -> None:
-        self.bytes, self.frames, self.corrupt = bytes, frames, corrupt
+        self.bytes, self.frames, self.repeated = bytes, frames, repeated
+        self.corrupt = corrupt
         """Stretches between two delimiters that were not a frame."""
         self.lost = lost
         """Frames missing from the sequence, including corrupt ones, but not overtaken ones."""
-        self.repeated, self.resynchronisations = repeated, resynchronisations
+        self.resynchronisations = resynchronisations
         """Frames found again after something corrupt."""
         self.unsent = 0
         """Sent frames that the port did not take at once."""

@@ -121,10 +121,10 @@ class Host:
         self._answers_s = deque[float](maxlen=LATE_DRIVES)
         """When the newest States came."""
         self._opens = 0
-        self.drives = self.states = self.senses = self.counter = 0
+        self.drives = self.states = self.senses = 0
         """How many Drives that must be answered were sent, and how many State came."""
         self.drive_s = self._next_s = line.port.now_s()
-        self.said = Drive(0.0, 0.0, DriveMode.OFF, 0)
+        self.counter, self.said = 0, Drive(0.0, 0.0, DriveMode.OFF, 0)
         self.stalled_s = self.late_s = 0.0
         """This process's greatest lateness since `begin`, and at all."""
 

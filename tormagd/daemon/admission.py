@@ -77,7 +77,7 @@ REASONS: dict[int, str] = {
     zmq.PROTOCOL_ERROR_ZMTP_MECHANISM_MISMATCH: PLAIN,
     zmq.PROTOCOL_ERROR_ZMTP_CRYPTOGRAPHIC: "another server's key",
 }
-UNASKED_KEY = "no handshake of an open endpoint: allowed is ZMTP 3 without a key"
+NOT_NULL = "no handshake of an open endpoint: allowed is ZMTP 3 without a key"
 
 log = logging.getLogger(__name__)
 
@@ -235,7 +235,7 @@ class Admission:
                 self._admit()
             self._disconnected(known, value)
         elif kind == zmq.EVENT_HANDSHAKE_FAILED_PROTOCOL:
-            known.failed = REASONS.get(value, "broken handshake") if known.is_guarded else UNASKED_KEY
+            known.failed = REASONS.get(value, "broken handshake") if known.is_guarded else NOT_NULL
         else:
             known.failed = PLAIN if known.is_guarded else "left in the handshake"
 

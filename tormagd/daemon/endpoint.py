@@ -64,7 +64,6 @@ PARTS_NS, MANY_PORTIONS = 400_000, 50
 "For how long a message's further parts are read and dropped in one beat, some three hundred, and in how many beats."
 TOO_MUCH, NOT_ALLOWED, OFF_THE_LIST = "sent too much", "command not allowed", "key taken off the list"
 MANY_PARTS = "a message of thousands of parts"
-NOBODY, NO_CONNECTION = Peer(""), -1
 LEAVES_MS = 20
 OBSERVED = frozenset({"status", "describe"})
 "What an observer may ask."
@@ -287,7 +286,7 @@ class Endpoint:
             key = str(frame.get("User-Id")) if name in self._guarded else ""
             peer = Peer(str(frame.get("Peer-Address")), key)
         except zmq.ZMQError:
-            return NOBODY, NO_CONNECTION
+            return Peer(""), -1
         self.admission.heard.add((name, connection))
         return peer, connection
 

@@ -131,12 +131,12 @@ class SourceClock:
     def __init__(self) -> None:
         self.offset_s = 0.0
         "The clock's lag behind ours."
-        self.way_s = self.jitter_s = 0.0
+        self.jitter_s = 0.0
         "RFC 3550's interarrival jitter."
-        self.steps, self.stepped_s = 0, 0.0
+        self.stepped_s = 0.0
         "Forward positive."
-        self.stepped_at_s = -math.inf
-        self._lateness_s = self._leaked_s = 0.0
+        self.steps, self.stepped_at_s = 0, -math.inf
+        self.way_s = self._lateness_s = self._leaked_s = 0.0
         self._heard_s: float | None = None
         self._settles_s: float | None = None
         self.line = DeviceClock()

@@ -375,11 +375,14 @@ class BlackBoxFile(Contents):
             raise RecordingError(f"{path}: {f'damaged: {damage}' if damage else none}")
         if self._expected and self.is_complete and not self.lost:
             self._compare(self._expected[0], None)
-        self.odd = self.odd or damage
+        self._note(damage)
 
     @property
     def is_complete(self) -> bool:
         return super().is_complete and not self._is_over
+
+    def _note(self, odd: str) -> None:
+        self.odd = self.odd or odd
 
     def _read_core(self, file: BinaryIO) -> None:
         """Keep the entries of `/core`, and compare what is derived of them, as far as no chunk is lost."""
@@ -394,7 +397,7 @@ class BlackBoxFile(Contents):
     def _compare(self, sent: Shown, expected: Shown | None) -> None:
         if sent != expected:
             other = expected or sent
-            self.odd = self.odd or f"message {other.sequence} in {other.topic} is not what {CORE_TOPIC} has"
+            self._note(f"message {other.sequence} in {other.topic} is not what {CORE_TOPIC} has")
 
     def _part(self, columns: tuple[str, ...], data: bytes) -> None:
         entries, self._size = msgspec.msgpack.decode(data, type=list[Any]), self._size + len(data)
@@ -406,7 +409,7 @@ class BlackBoxFile(Contents):
             for shown in () if self.lost else self._derived.of(columns, entries):
                 self._expected.append(shown._replace(message=msgspec.json.encode(shown.message)))
         except (ValueError, TypeError, AttributeError, OverflowError, LookupError) as error:
-            self.odd = self.odd or f"{CORE_TOPIC}: {str(error)[:100]}"
+            self._note(f"{CORE_TOPIC}: {str(error)[:100]}")
         self.entries.extend(entries)
 
     def _join(self, numbers: list[int]) -> None:

@@ -220,9 +220,8 @@ class RecordingWriter:
         if batch.core:
             entries = msgspec.msgpack.decode(batch.core, type=list[Any])
         self.entries(batch.columns, entries, batch.core)
-        if self._folder is not None and self._folder.is_due(
-            self._file.tell(), ((self._chunk_ns - self._begin_ns) * 1e-9)
-        ):
+        lasts_s = (self._chunk_ns - self._begin_ns) * 1e-9
+        if self._folder is not None and self._folder.is_due(self._file.tell(), lasts_s):
             try:
                 path = self._folder.new()
             except OSError as error:  # what is written is ended in order, whatever the reason
